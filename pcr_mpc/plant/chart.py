@@ -1,0 +1,267 @@
+"""A chart of the stable shapes of one rod: where a cold start begins.
+
+With clamp tangent along +x and a moment-free tip, a normalised rod is the pendulum
+delta'' = sin(delta) in u = lambda * (distance from the tip), where delta is the angle from the rod's
+tangent to its internal force and lambda^2 the size of that force. It starts at rest at the tip with
+delta = tip_angle in (0, pi), and its mirror image covers the other handedness. A taut rod has
+tip_angle of the order of exp(-lambda), so its logarithm is carried.
+
+The rod is stable with its tip held for lambda below the first zero of det d(xi, eta)/d(log tip_angle, lambda):
+the sheet of stable shapes is tabulated once, and a tip position is looked up by the triangles that cover it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+_MAX_LOAD = 600.0  # largest lambda on the sheet, about
+_LAMBDA_STEPS = 480  # RK4 steps along each trajectory
+_COLUMNS = 96  # columns of the tabulated sheet
+_LAUNCH = 1e-4  # delta up to which the pendulum is linear to rounding
+_TAUT = -21.0  # log(tip_angle) below which that stretch is skipped
+_POLISH_STEPS = 512  # RK4 steps of the exact tip map
+_POLISHED = 1e-8  # distance from the target, in units of L
+
+
+@dataclass(frozen=True)
+class HeldShape:
+    """One stable shape of a rod whose tip is held.
+
+    Attributes
+    ----------
+    hand : int
+        +1 if the rod turns left towards its tip (m > 0 there), -1 for the mirror image.
+    log_tip_angle : float
+        Logarithm of the angle between the tip's tangent and the tip force, which lies in (0, pi) rad.
+    load : float
+        lambda, the square root of the normalised tip force.
+    energy : float
+        Elastic energy, normalised by EI/L.
+    """
+
+    hand: int
+    log_tip_angle: float
+    load: float
+    energy: float
+
+    def polished(self, xi: float, eta: float) -> HeldShape | None:
+        """The exact shape near this one whose tip is at (xi, eta), or None if Newton's method finds none."""
+        unknowns = np.array([self.log_tip_angle, self.load])
+        target = np.array([xi, self.hand * eta])
+        value = _evaluate_tip(unknowns, target)
+        for _ in range(20):
+            step = -np.linalg.lstsq(value[1], value[0], rcond=1e-14)[0]
+            # Half a unit is a large change of either unknown.
+            step *= min(1.0, 0.5 / max(np.abs(step).max(), 1e-300))
+            while True:
+                trial = _evaluate_tip(unknowns + step, target)
+                if np.linalg.norm(trial[0]) < np.linalg.norm(value[0]):
+                    break
+                step = step / 2
+                if np.abs(step).max() < 1e-9:
+                    return None
+            unknowns, value = unknowns + step, trial
+            if np.linalg.norm(value[0]) < _POLISHED:
+                return HeldShape(self.hand, float(unknowns[0]), float(unknowns[1]), value[2])
+        return None
+
+    def nodes(self, n_nodes: int, clamp_angle: float) -> np.ndarray:
+        """Nodal states [theta, n_x, n_y, m] for multiple shooting, shape (4, n_nodes), normalised."""
+        launch, state = _launch(np.asarray(self.log_tip_angle))
+        u = self.load * (1.0 - np.arange(n_nodes) / n_nodes)
+        pendulum = np.exp(self.log_tip_angle) * np.stack([np.cosh(u), np.sinh(u)], axis=1)
+        at = float(launch)
+        for j in np.flatnonzero(u > at)[::-1]:
+            substeps = max(1, int(np.ceil(20 * (u[j] - at))))
+            for _ in range(substeps):
+                state = _rk4(_pendulum, state, (u[j] - at) / substeps)
+            pendulum[j], at = state[:2], u[j]
+        delta, rate = pendulum.T
+        theta = self.hand * (delta[0] - delta) + clamp_angle
+        psi = self.hand * delta[0] + clamp_angle
+        force = self.load**2
+        return np.array(
+            [
+                theta,
+                np.full(n_nodes, force * np.cos(psi)),
+                np.full(n_nodes, force * np.sin(psi)),
+                self.hand * self.load * rate,
+            ]
+        )
+
+
+def held_shapes(xi: float, eta: float) -> list[HeldShape]:
+    """Stable shapes of a rod clamped at the origin along +x with its tip at (xi, eta), in units of L.
+
+    Returns
+    -------
+    list of HeldShape
+        By increasing energy, to the resolution of the chart (a start for Newton's method, not a
+        solution). If the tip lies in a gap of the chart (nearly straight rods), the nearest entry.
+    """
+    chart = _chart()
+    found = []
+    for hand in (1, -1):
+        target = np.array([xi, hand * eta])
+        rows, weights = _containing(chart.triangles, target)
+        for row, w in zip(rows, weights, strict=True):
+            corners = chart.corners[row]
+            values = (w @ field[corners] for field in (chart.log_tip_angle, chart.load, chart.energy))
+            found.append(HeldShape(hand, *(float(value) for value in values)))
+    if not found:
+        distance = [np.hypot(chart.points[:, 0] - xi, chart.points[:, 1] - hand * eta) for hand in (1, -1)]
+        hand = 1 if distance[0].min() <= distance[1].min() else -1
+        at = int(np.argmin(distance[0 if hand == 1 else 1]))
+        found = [HeldShape(hand, *(float(field[at]) for field in (chart.log_tip_angle, chart.load, chart.energy)))]
+    return sorted(found, key=lambda shape: shape.energy)
+
+
+def _evaluate_tip(unknowns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Tip minus target, its Jacobian in (log tip_angle, load), and the energy."""
+    tip, jacobian, energy = _tip_map()(unknowns)
+    return tip.full().ravel() - target, jacobian.full(), float(energy)
+
+
+@lru_cache
+def _tip_map() -> Any:
+    state, h, unknowns = ca.SX.sym("state", 4), ca.SX.sym("h"), ca.MX.sym("unknowns", 2)
+
+    def slope(x: Any) -> Any:
+        return ca.vertcat(x[1], ca.sin(x[0]), ca.cos(x[0]), ca.sin(x[0]))
+
+    step = ca.Function("step", [state, h], [_rk4(slope, state, h)]).fold(_POLISH_STEPS)
+    log_tip_angle, load = unknowns[0], unknowns[1]
+    tip_angle, taut = ca.exp(log_tip_angle), log_tip_angle < _TAUT
+    launch = ca.if_else(taut, np.log(2.0 * _LAUNCH) - log_tip_angle, 0.0)
+    small = ca.if_else(taut, _LAUNCH, 0.0)
+    start = ca.vertcat(ca.if_else(taut, _LAUNCH, tip_angle), small, launch, small)
+    end = step(start, ca.repmat((load - launch) / _POLISH_STEPS, 1, _POLISH_STEPS))
+    cos, sin, c, s = ca.cos(end[0]), ca.sin(end[0]), end[2], end[3]
+    tip = ca.vertcat(cos * c + sin * s, sin * c - cos * s) / load
+    energy = load**2 * ca.cos(tip_angle) - load * c
+    return ca.Function("tip_map", [unknowns], [tip, ca.jacobian(tip, unknowns), energy])
+
+
+@dataclass(frozen=True, eq=False)
+class _Chart:
+    points: np.ndarray  # (M, 2) tip positions
+    log_tip_angle: np.ndarray  # (M,)
+    load: np.ndarray  # (M,)
+    energy: np.ndarray  # (M,)
+    corners: np.ndarray  # (T, 3) indices of each triangle's corners
+    triangles: np.ndarray  # (T, 3, 2) their positions
+
+
+@lru_cache
+def _chart() -> _Chart:
+    log_tip_angle = np.concatenate(
+        [-np.geomspace(_MAX_LOAD, 2.5, 150), np.log(np.linspace(0.1, np.pi - 1e-3, 110))]
+    )
+    load, delta, sheet, determinant = _trajectories(log_tip_angle)
+    # The determinant has no zero before the quarter period, where it may be all rounding.
+    middle = np.argmax(load > _quarter_period(log_tip_angle)[:, None], axis=1)
+    # Columns follow the turning of the base, so that taut rods (all turning within the last few u) are resolved.
+    turning = np.abs(np.diff(delta, axis=1, prepend=delta[:, :1])) + 3.0 / _LAMBDA_STEPS
+    columns = np.empty((4, len(log_tip_angle), _COLUMNS))
+    for i, values in enumerate(determinant):
+        unstable = np.flatnonzero(values[middle[i] :] * np.sign(values[middle[i]]) <= 0)
+        last = middle[i] + unstable[0] if unstable.size else len(values) - 1  # the zero lies just before
+        measure = np.cumsum(turning[i, : last + 1])
+        at = np.linspace(measure[0], measure[-1], _COLUMNS)
+        columns[:, i] = [np.interp(at, measure, f[i, : last + 1]) for f in (load, *sheet)]
+    loads = columns[0]
+    points = columns[1:3].reshape(2, -1).T
+    index = np.arange(points.shape[0]).reshape(loads.shape)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    corners = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return _Chart(
+        points=points,
+        log_tip_angle=np.broadcast_to(log_tip_angle[:, None], loads.shape).ravel(),
+        load=loads.ravel(),
+        energy=columns[3].ravel(),
+        corners=corners,
+        triangles=points[corners],
+    )
+
+
+def _quarter_period(log_tip_angle: np.ndarray) -> np.ndarray:
+    """Load at which the pendulum hangs (delta = pi), K(k), to 5 %."""
+    return np.asarray(np.log(8.0) - log_tip_angle + 0.25)
+
+
+def _trajectories(log_tip_angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
+    """Load, delta, (tip position and energy) and stability determinant along each trajectory."""
+    # The determinant's first zero lies before 2 K(k), half a swing of the pendulum. For very taut rods the far
+    # half would carry a full loop, and 2 pi - delta underflows there: 16 past the middle is as far as it is exact.
+    quarter_period = _quarter_period(log_tip_angle)
+    launch, state = _launch(log_tip_angle)
+    end = np.maximum(8.2, np.minimum(2.0 * quarter_period, quarter_period + 16.0)) - launch
+    h = end / _LAMBDA_STEPS
+    # Tangents with respect to log(tip_angle), by which the linear part of the motion is scaled.
+    state = np.concatenate([state, state[:2], 0 * state[:1], state[3:]])
+    states = []
+    for _ in range(_LAMBDA_STEPS):
+        state = _rk4(_pendulum_with_tangent, state, h)
+        states.append(state)
+    path = np.stack(states, axis=-1)  # (8, angles, loads)
+    delta, rate, c, s, d_delta, _, d_c, d_s = path
+    load = launch[:, None] + h[:, None] * np.arange(1, _LAMBDA_STEPS + 1)
+    cos, sin = np.cos(delta), np.sin(delta)
+    xi, eta = (cos * c + sin * s) / load, (sin * c - cos * s) / load
+    # Differentiate the tip with respect to (log tip_angle, load): d(cos) = -sin d(delta), and so on.
+    xi_a = (cos * d_c + sin * d_s + (cos * s - sin * c) * d_delta) / load
+    eta_a = (sin * d_c - cos * d_s + (cos * c + sin * s) * d_delta) / load
+    xi_l = (1.0 - eta * load * rate - xi) / load  # cos^2 + sin^2 = 1 from dc/du = cos, ds/du = sin
+    eta_l = (xi * load * rate - eta) / load
+    energy = load**2 * np.cos(np.exp(log_tip_angle))[:, None] - load * c
+    return load, delta, [xi, eta, energy], xi_a * eta_l - eta_a * xi_l
+
+
+def _launch(log_tip_angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where to start integrating, and the state (delta, rate, C, S) there.
+
+    Near the tip of a taut rod delta = tip_angle cosh(u) to rounding: that stretch, up to `_LAUNCH`, is skipped.
+    """
+    taut = log_tip_angle < _TAUT
+    u = np.where(taut, np.log(2.0 * _LAUNCH) - log_tip_angle, 0.0)
+    tip_angle = np.exp(log_tip_angle)
+    return u, np.array(
+        [np.where(taut, _LAUNCH, tip_angle), np.where(taut, _LAUNCH, 0.0), u, np.where(taut, _LAUNCH, 0.0)]
+    )
+
+
+def _pendulum(state: np.ndarray) -> np.ndarray:
+    delta, rate, _, _ = state
+    return np.array([rate, np.sin(delta), np.cos(delta), np.sin(delta)])
+
+
+def _pendulum_with_tangent(state: np.ndarray) -> np.ndarray:
+    delta, rate, _, _, d_delta, d_rate, _, _ = state
+    sin, cos = np.sin(delta), np.cos(delta)
+    return np.array([rate, sin, cos, sin, d_rate, cos * d_delta, -sin * d_delta, cos * d_delta])
+
+
+def _rk4(f, state, h):  # type: ignore[no-untyped-def]
+    k1 = f(state)
+    k2 = f(state + h / 2 * k1)
+    k3 = f(state + h / 2 * k2)
+    k4 = f(state + h * k3)
+    return state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def _containing(triangles: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the triangles that contain ``target`` and its barycentric coordinates there."""
+    origin = triangles[:, 0]
+    e1, e2, r = triangles[:, 1] - origin, triangles[:, 2] - origin, target - origin
+    area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w1 = (r[:, 0] * e2[:, 1] - r[:, 1] * e2[:, 0]) / area
+        w2 = (e1[:, 0] * r[:, 1] - e1[:, 1] * r[:, 0]) / area
+        slack = 1e-9
+        inside = np.flatnonzero((w1 >= -slack) & (w2 >= -slack) & (w1 + w2 <= 1 + slack))
+    return inside, np.stack([1 - w1[inside] - w2[inside], w1[inside], w2[inside]], axis=1)

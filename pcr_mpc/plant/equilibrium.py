@@ -1,0 +1,111 @@
+"""The solved state of the rods, and everything that follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from .robot import Robot
+from .rod import sample_rod
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrium:
+    """Static equilibrium of the rods for a held tip: it exists only if the solve converged.
+
+    With U(p, q) the elastic energy, force = dU/dp is what holds the joint and motor_torque = dU/dq is
+    what the motors supply.
+
+    Attributes
+    ----------
+    robot : Robot
+    p : ndarray, shape (2,)
+        Tip position [m].
+    q : ndarray, shape (n,)
+        Motor angles [rad].
+    method : str
+        How it was solved.
+    force : ndarray, shape (2,)
+        F = dU/dp, held against the rods [N].
+    dforce_dp : ndarray, shape (2, 2)
+        K = d2U/dp2 [N/m].
+    dforce_dq : ndarray, shape (2, n)
+        G = d2U/dpdq [N/rad]; dtau/dp is its transpose.
+    motor_torque : ndarray, shape (n,)
+        tau = dU/dq [N m].
+    dtorque_dq : ndarray, shape (n,)
+        Diagonal of d2U/dq2 [N m/rad]; rods do not couple at a held tip.
+    energy : float
+        U [J].
+    rod_forces : ndarray, shape (n, 2)
+        n_i, force applied to the tip of each rod [N].
+    nodes : ndarray, shape (n, 4, N)
+        [theta, n_x, n_y, m] at s = j L/N of each rod, in units [rad, EI/L^2, EI/L^2, EI/L].
+    residual_norm : float
+        2-norm of the weighted residual (dimensionless).
+    iterations : int
+        Newton iterations of the slowest rod.
+    drift : float
+        Largest change along a rod of m^2/2 + n . t over its size: the discretisation's own error estimate.
+    unstable_rods : tuple of int
+        Rods with a conjugate point: not stable even with the tip held.
+    """
+
+    robot: Robot
+    p: np.ndarray
+    q: np.ndarray
+    method: str
+    force: np.ndarray
+    dforce_dp: np.ndarray
+    dforce_dq: np.ndarray
+    motor_torque: np.ndarray
+    dtorque_dq: np.ndarray
+    energy: float
+    rod_forces: np.ndarray
+    nodes: np.ndarray
+    residual_norm: float
+    iterations: int
+    drift: float
+    unstable_rods: tuple[int, ...]
+    converged: bool = True
+
+    def __post_init__(self) -> None:
+        for value in self.__dict__.values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+    @cached_property
+    def stiffness_eigenvalues(self) -> np.ndarray:
+        """Eigenvalues of K, ascending, shape (2,) [N/m]."""
+        return np.asarray(np.linalg.eigvalsh((self.dforce_dp + self.dforce_dp.T) / 2))
+
+    @property
+    def stable(self) -> bool:
+        """Whether the pose is stable with its motors held: every rod with its tip held, and K > 0."""
+        return not self.unstable_rods and bool(self.stiffness_eigenvalues[0] > 0)
+
+    @cached_property
+    def mode(self) -> str:
+        """Working mode: for each rod the side of its chord, seen from base to tip, to which it bows at its tip.
+
+        One letter a rod, L(eft) or R(ight): the default robot with its rods bowed outward is "LR".
+        """
+        letters = []
+        for nodes in self.nodes:
+            _, _, theta, n_x, n_y, _ = sample_rod(nodes, 2)[:, -1]
+            # Near the moment-free tip the rod turns as -m'(L) = n_y cos(theta) - n_x sin(theta).
+            letters.append("R" if n_y * np.cos(theta) > n_x * np.sin(theta) else "L")
+        return "".join(letters)
+
+    def shape(self, n_points: int = 50) -> np.ndarray:
+        """Centrelines from base to tip, shape (n, n_points, 2) [m]."""
+        if n_points < 2:
+            raise ValueError(f"n_points is {n_points}, expected at least 2")
+        return np.stack(
+            [
+                rod.base + rod.length * sample_rod(nodes, n_points)[:2].T
+                for rod, nodes in zip(self.robot.rods, self.nodes, strict=True)
+            ]
+        )

@@ -1,0 +1,304 @@
+"""Poses at which the tip is in balance: forward (motors -> tip) and inverse (tip -> motors) statics."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
+from .chart import held_shapes
+from .equilibrium import Equilibrium
+from .robot import Robot
+from .rod_solver import RodSolver, Shooting
+
+_MAX_ITERATIONS = 100
+_FORCE_TOLERANCE = 1e-9  # of the robot's force scale, sum EI/L^2
+_ANGLE_STEP = 0.25  # largest motor step of a continuation [rad]
+_OFFSETS = np.linspace(-2.6, 2.6, 40)  # clamp angle minus chord angle, of a cold inverse start [rad]
+_CANDIDATES = 24
+
+
+def forward_statics(
+    robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equilibrium | None = None
+) -> Equilibrium:
+    """Tip position at which the rods carry a given force: the free pose for given motors.
+
+    Parameters
+    ----------
+    q : array_like, shape (n,)
+        Motor angles [rad].
+    force : array_like, shape (2,)
+        Wanted F = dU/dp [N], equal to the external force on the tip.
+    guess : Equilibrium, optional
+        Its branch is followed to (q, force) by continuation. None: the stable pose of least potential
+        energy among those found by descent from several tip positions.
+
+    Returns
+    -------
+    Equilibrium
+        Stable, with ``eq.force == force``; ``eq.mode`` says which working mode it is.
+
+    Raises
+    ------
+    UnstableError
+        The branch ends at a fold before q is reached.
+    ConvergenceError
+        No stable pose was found.
+    """
+    q, force = checked_vector("q", q, robot.n_rods), checked_vector("force", force, 2)
+    solver = _solver(robot, threading.get_ident())
+    if guess is not None:
+        solver.start(guess.p, guess.q, _nodes_of(guess, solver))
+        n_steps = int(np.ceil(np.abs(q - guess.q).max() / _ANGLE_STEP)) + 1
+        p = guess.p
+        for t in np.linspace(0.0, 1.0, n_steps + 1)[1:]:
+            p = _settle(solver, p, guess.q + t * (q - guess.q), guess.force + t * (force - guess.force))
+        return solver.equilibrium(p, q)
+    found: list[Equilibrium] = []
+    last: PCRError | None = None
+    for start in _tip_starts(robot, q):
+        try:
+            solver.start(start, q)
+            found.append(solver.equilibrium(_settle(solver, start, q, force), q))
+        except PCRError as error:
+            last = error
+    if not found:
+        raise ConvergenceError(
+            f"no stable pose found for q = {q} rad under {force} N; last failure: {last}; "
+            "check that the rods can meet, or pass a guess",
+            residual=np.nan,
+            iterations=0,
+            last=None,
+        )
+    return min(found, key=lambda eq: eq.energy - force @ eq.p)
+
+
+def inverse_statics(
+    robot: Robot, p: Any, force: Any = (0.0, 0.0), guess: Equilibrium | None = None, mode: str | None = None
+) -> Equilibrium:
+    """Motor angles that hold the tip at p while the rods carry a given force.
+
+    With more than two rods the angles are not unique: those nearest to the guess are taken.
+
+    Parameters
+    ----------
+    p : array_like, shape (2,)
+        Tip position [m].
+    force : array_like, shape (2,)
+        Wanted F = dU/dp [N]: external force minus what the motion needs, f_ext - m a - c v.
+    guess : Equilibrium, optional
+        Its branch is followed to (p, force). None: a search within the motors' limits.
+    mode : str, optional
+        Working mode to look for in a cold search, such as "LR" (see `Equilibrium.mode`).
+        None: the stable pose of least energy.
+
+    Raises
+    ------
+    UnreachableError
+        If |p - base_i| >= L_i for some rod i.
+    ConvergenceError
+        No stable pose of that mode was found within the motors' limits.
+    """
+    p, force = checked_vector("p", p, 2), checked_vector("force", force, 2)
+    robot.require_reachable(p)
+    solver = _solver(robot, threading.get_ident())
+    if guess is not None:
+        solver.start(guess.p, guess.q, _nodes_of(guess, solver))
+        return solver.equilibrium(p, _reach(solver, guess, p, force))
+    if mode is not None and (len(mode) != robot.n_rods or set(mode) - set("LR")):
+        raise ValueError(f"mode is {mode!r}, expected {robot.n_rods} letters L or R")
+    found: list[Equilibrium] = []
+    for q in _angle_starts(robot, p, force, mode):
+        try:
+            solver.start(p, q)
+            eq = solver.equilibrium(p, _turn(solver, p, q, force))
+        except PCRError:
+            continue
+        lower, upper = robot.angle_limits.T
+        if eq.stable and (mode in (None, eq.mode)) and (eq.q >= lower).all() and (eq.q <= upper).all():
+            found.append(eq)
+    if not found:
+        raise ConvergenceError(
+            f"no stable pose{f' of mode {mode}' if mode else ''} found that holds p = {p} m with force {force} N "
+            f"within the motor limits {robot.angle_limits.tolist()} rad; try another mode or a nearer tip",
+            residual=np.nan,
+            iterations=0,
+            last=None,
+        )
+    return min(found, key=lambda eq: eq.energy)
+
+
+def _settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Descend the potential energy U(p, q) - force . p by Newton's method with a bounded step."""
+    robot = solver.robot
+    tolerance = _FORCE_TOLERANCE * _force_scale(robot)
+    solver.move(p, q)
+    energy = solver.energy() - force @ p
+    radius = 0.1 * robot.lengths.min()
+    for iteration in range(_MAX_ITERATIONS):
+        residual = np.array(solver.force()) - force
+        stiffness, _ = solver.jacobians()
+        values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
+        if np.linalg.norm(residual) <= tolerance:
+            if values[0] <= 0 or solver.unstable_rods():
+                raise UnstableError(
+                    f"the pose p = {p} m, q = {q} rad is in balance but not stable: smallest stiffness "
+                    f"{values[0]:.4g} N/m, unstable rods {solver.unstable_rods()}; "
+                    "the branch ended, choose other motor angles",
+                    eigenvalue=float(values[0]),
+                    rod=solver.unstable_rods(),
+                    p=p,
+                    q=q,
+                )
+            return p
+        # Newton where the energy is convex, downhill where it is not.
+        step = -vectors @ ((vectors.T @ residual) / np.maximum(np.abs(values), 1e-3 * np.abs(values).max()))
+        step *= min(1.0, radius / float(np.linalg.norm(step)))
+        while True:
+            try:
+                robot.require_reachable(p + step)
+                solver.move(p + step, q)
+                trial = solver.energy() - force @ (p + step)
+                # Near the minimum the energy is flat to rounding: there the force must shrink instead.
+                if trial < energy or np.linalg.norm(np.array(solver.force()) - force) < 0.5 * np.linalg.norm(residual):
+                    break
+            except PCRError:
+                pass
+            step = step / 2
+            if np.linalg.norm(step) < 1e-7 * robot.lengths.min():
+                raise ConvergenceError(
+                    f"the tip cannot settle near p = {p} m for q = {q} rad: force residual "
+                    f"{np.linalg.norm(residual):.3g} N after {iteration} iterations; pass a guess on the branch you want",
+                    residual=float(np.linalg.norm(residual)),
+                    iterations=iteration,
+                    last=p,
+                )
+        p, energy = p + step, trial
+    raise ConvergenceError(
+        f"the tip did not settle in {_MAX_ITERATIONS} iterations, last at p = {p} m, force residual "
+        f"{np.linalg.norm(residual):.3g} N; pass a guess",
+        residual=float(np.linalg.norm(residual)),
+        iterations=_MAX_ITERATIONS,
+        last=p,
+    )
+
+
+def _reach(solver: RodSolver, guess: Equilibrium, p: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Follow the branch of ``guess`` to (p, force), in sub-steps where one step fails."""
+    q, done, substep = guess.q, 0.0, 1.0
+    while done < 1.0:
+        target = min(1.0, done + substep)
+        try:
+            q = _turn(
+                solver, guess.p + target * (p - guess.p), q, guess.force + target * (force - guess.force)
+            )
+        except ConvergenceError as error:
+            substep /= 2
+            if substep < 1e-2:
+                raise ConvergenceError(
+                    f"no motor angles hold p = {p} m with force {force} N on the branch of the guess; got "
+                    f"{100 * done:.0f} % of the way from p = {guess.p} m; {error}",
+                    residual=error.residual,
+                    iterations=error.iterations,
+                    last=q,
+                ) from None
+        else:
+            done, substep = target, 2 * substep
+    return q
+
+
+def _turn(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Turn the motors by Newton's method (least motion if redundant) until the rods carry ``force`` at p."""
+    tolerance = _FORCE_TOLERANCE * _force_scale(solver.robot)
+    solver.move(p, q)
+    residual = force - np.array(solver.force())
+    for iteration in range(_MAX_ITERATIONS):
+        if np.linalg.norm(residual) <= tolerance:
+            return q
+        _, sensitivity = solver.jacobians()
+        step = np.linalg.lstsq(sensitivity, residual, rcond=1e-10)[0]
+        step *= min(1.0, _ANGLE_STEP / float(np.abs(step).max()))
+        while True:
+            solver.move(p, q + step)
+            trial = force - np.array(solver.force())
+            if np.linalg.norm(trial) < np.linalg.norm(residual):
+                break
+            step = step / 2
+            if np.abs(step).max() < 1e-10:
+                raise ConvergenceError(
+                    f"motors cannot balance p = {p} m: force residual {np.linalg.norm(residual):.3g} N at q = {q} rad",
+                    residual=float(np.linalg.norm(residual)),
+                    iterations=iteration,
+                    last=q,
+                )
+        q, residual = q + step, trial
+    raise ConvergenceError(
+        f"motors did not balance p = {p} m in {_MAX_ITERATIONS} iterations: force residual "
+        f"{np.linalg.norm(residual):.3g} N at q = {q} rad",
+        residual=float(np.linalg.norm(residual)),
+        iterations=_MAX_ITERATIONS,
+        last=q,
+    )
+
+
+def _tip_starts(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
+    """Tip positions to descend from: where the straight rods would end, drawn into reach, and points around it."""
+    straight = robot.bases + robot.lengths[:, None] * np.stack([np.cos(q), np.sin(q)], axis=1)
+    centre = robot.bases.mean(axis=0)
+    radius = 0.5 * robot.lengths.min()
+    starts = [straight.mean(axis=0)]
+    starts += [centre + radius * np.array([np.cos(a), np.sin(a)]) for a in np.pi * np.arange(8) / 4 + np.pi / 2]
+    inside = []
+    for start in starts:
+        for _ in range(60):
+            if (np.linalg.norm(start - robot.bases, axis=1) < 0.9 * robot.lengths).all():
+                inside.append(start)
+                break
+            start = start + 0.1 * (centre - start)
+    return inside
+
+
+def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | None) -> list[np.ndarray]:
+    """Motor angles within limits whose coarse shapes nearly carry ``force``, best first."""
+    per_rod = []
+    for i, rod in enumerate(robot.rods):
+        dx, dy = (p - rod.base) / rod.length
+        chord = np.arctan2(dy, dx)
+        lower, upper = rod.angle_limits
+        unit = rod.bending_stiffness / rod.length**2
+        rows = []
+        for angle in chord + _OFFSETS:
+            angle = lower + (angle - lower) % (2 * np.pi)
+            if angle > upper:
+                continue
+            cos, sin = np.cos(angle), np.sin(angle)
+            shape = held_shapes(cos * dx + sin * dy, cos * dy - sin * dx)[0]
+            if mode is None or ("L" if shape.hand < 0 else "R") == mode[i]:
+                n_x, n_y = shape.nodes(1, angle)[1:3, 0] * unit
+                rows.append((angle, n_x, n_y, shape.energy))
+        per_rod.append(rows)
+    scored = []
+    scale = _force_scale(robot)
+    for combination in itertools.islice(itertools.product(*per_rod), 200_000):
+        angles, n_x, n_y, energy = zip(*combination, strict=True)
+        mismatch = np.hypot(sum(n_x) - force[0], sum(n_y) - force[1]) / scale
+        scored.append((mismatch + 0.02 * sum(energy), angles))
+    scored.sort()
+    return [np.array(angles) for _, angles in scored[:_CANDIDATES]]
+
+
+def _force_scale(robot: Robot) -> float:
+    return float((robot.stiffnesses / robot.lengths**2).sum())
+
+
+def _nodes_of(guess: Equilibrium, solver: RodSolver) -> np.ndarray | None:
+    return guess.nodes if guess.nodes.shape[2] == solver.shooting.segments else None
+
+
+@lru_cache(maxsize=32)
+def _solver(robot: Robot, thread: int) -> RodSolver:
+    return RodSolver(robot, Shooting())

@@ -1,0 +1,178 @@
+"""Multiple shooting of the rods, paper sec. 4, solved in O(N) by a Riccati sweep.
+
+Unknowns. Rod i has nodes j = 0 .. N-1 at s = j L/N, each with z = [theta, n_x, n_y, m]. The paper counts
+8N unknowns for two rods; that closes against its 8N residuals when theta_{i,0} = q_i is prescribed (one
+unknown less per rod) and the joint force F, which eq. (13) uses but eq. (9) leaves out, is solved for:
+n (4N - 1) + 2 unknowns and as many residuals for n rods.
+
+Sparsity of one rod's Jacobian (N = 4, rows: continuity, position, tip moment; * a dense block)::
+
+             w_0  z_1  z_2  z_3              w = [n_x, n_y, m], since theta_0 = q is prescribed
+    gap_1     *   -I
+    gap_2          *   -I
+    gap_3               *   -I
+    position  *    *    *    *                displacements of all segments add up to p - b
+    moment                   *                m(L) = 0
+
+and the force balance F = sum n_i(L) appends two rows that only define F. At given (p, q) the rods therefore
+do not couple, and each is solved by itself.
+
+The sweep. Let x = [x, y, theta, n_x, n_y, m] be a change of the state at a node, positions included (they
+are the sums of the displacements before it). The linearised segments read dx+ = Phi dx + c, and the tip
+conditions (position held, no moment) are three equations T dx = r. Substituting from the tip backwards,
+
+    T_j = T_{j+1} Phi_j,     r_j = r_{j+1} - T_{j+1} c_j,
+
+with the rows of [T | r] made orthonormal in T after every segment, gives at the base three equations for
+[n_x, n_y, m]_0, and one forward pass gives the Newton step. Forward, each node is projected onto its own
+T dx = r: without that and the orthogonalisation, errors grow like exp(lambda) on taut rods, as they do in
+plain condensing. The alternative that carries the stiffness of the rod's far part from node to node
+(a Riccati recursion) fails too: an inextensible straight tail is infinitely stiff.
+
+The same equations with r = 0 and a moved or turned base are the implicit function theorem: they give every
+derivative of the equilibrium from the factorisation of the Newton step. And where the part of T that
+belongs to [n_x, n_y, m] changes the sign of its determinant, the rod beyond that node has a non-zero
+deflection with both ends held: a conjugate point, and the rod is unstable.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .robot import Robot
+from .rod import propagation
+
+# A straight tail has determinant 0; with orthonormal rows, less than this is rounding.
+_DETERMINANT_ROUNDING = 1e-15
+
+
+@lru_cache
+def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
+    """Build the graphs of one rod in normalised units.
+
+    Returns
+    -------
+    newton : casadi.Function
+        (nodes (4N), d (2)) -> step (4N), tangent (4N, 3), base_loads (3, 3), scalars (4): the Newton
+        step; the derivatives of all nodes and of the base's
+        [n_x, n_y, m] with respect to (d_x, d_y, theta_0); and residual norm, energy, number of conjugate points, drift of the invariant m^2/2 + n . t.
+        d is the tip relative to the base; nodes[0] = theta_0 is kept.
+    residual : casadi.Function
+        (nodes, d) -> residual norm.
+    """
+    n, h = segments, 1.0 / segments
+    flat, d = ca.SX.sym("nodes", 4 * n), ca.SX.sym("d", 2)
+    z = [flat[4 * j : 4 * j + 4] for j in range(n)]
+    ends = [propagation(steps, scheme)(node, h) for node in z]
+    gaps = [ends[j][2:6] - z[j + 1] for j in range(n - 1)]
+    position = sum(end[:2] for end in ends) - d
+    moment = ends[-1][5]
+    norm = ca.norm_2(ca.vertcat(*gaps, position, moment))
+
+    transition, gap = [], []
+    for j, (end, node) in enumerate(zip(ends, z, strict=True)):
+        jacobian = ca.jacobian(end[:6], node)  # of dx, dy and the state at the end
+        transition.append(ca.horzcat(ca.vertcat(ca.SX.eye(2), ca.SX(4, 2)), jacobian))
+        gap.append(ca.vertcat(0, 0, gaps[j] if j < n - 1 else ca.SX(4, 1)))
+
+    conditions = ca.vertcat(ca.SX.eye(6)[:2, :], ca.SX.eye(6)[5, :])
+    t, r = [conditions], [-ca.vertcat(position, moment)]
+    conjugate_points = ca.SX(0)
+    for j in range(n - 1, -1, -1):
+        rows, rhs = _orthonormal_rows(t[0] @ transition[j], r[0] - t[0] @ gap[j])
+        t.insert(0, rows)
+        r.insert(0, rhs)
+        conjugate_points += _determinant3(rows[:, 3:]) < -_DETERMINANT_ROUNDING
+
+    # Forward: column 0 is the Newton step; the others start from a moved or turned base. Moving the tip
+    # is moving the base the other way, so the tangent with respect to d has the opposite sign.
+    base = ca.horzcat(ca.SX(3, 1), -ca.SX.eye(3)[:, :2], ca.SX.eye(3)[:, 2])
+    first = ca.DM([[1, 0, 0, 0]])
+    base_loads = _solve3(t[0][:, 3:], r[0] @ first - t[0][:, :3] @ base)
+    change = ca.vertcat(base, base_loads)
+    moves = [change[2:, :]]
+    for j in range(n - 1):
+        change = transition[j] @ change + gap[j] @ first
+        change -= t[j + 1].T @ (t[j + 1] @ change - r[j + 1] @ first)
+        moves.append(change[2:, :])
+    moves = ca.vertcat(*moves)
+
+    energy = sum(end[6] for end in ends)
+    drift = _invariant(ends[-1][2:6]) - _invariant(z[0])
+    results = [moves[:, 0], moves[:, 1:], base_loads[:, 1:], ca.vertcat(norm, energy, conjugate_points, drift)]
+    options = {"cse": True}
+    newton = ca.Function("rod_newton", [flat, d], [ca.densify(r) for r in results], options)
+    return newton, ca.Function("rod_residual", [flat, d], [norm], options)
+
+
+def _invariant(z: Any) -> Any:
+    """m^2/2 + n . t, constant along an exact rod; its drift measures the discretisation."""
+    return z[3] ** 2 / 2 + z[1] * ca.cos(z[0]) + z[2] * ca.sin(z[0])
+
+
+def _orthonormal_rows(t: Any, r: Any) -> tuple[Any, Any]:
+    """Replace the equations t dx = r (3 x 6) by equivalent ones with orthonormal rows (Gram-Schmidt)."""
+    rows: list[Any] = []
+    for i in range(3):
+        row = ca.horzcat(t[i, :], r[i])
+        for done in rows:
+            row -= ca.dot(row[:6], done[:6]) * done
+        rows.append(row / ca.norm_2(row[:6]))
+    stacked = ca.vertcat(*rows)
+    return stacked[:, :6], stacked[:, 6]
+
+
+def _determinant3(m: Any) -> Any:
+    return ca.dot(m[0, :], ca.cross(m[1, :], m[2, :]))
+
+
+def _solve3(m: Any, rhs: Any) -> Any:
+    """Solve a 3 x 3 system by the cross products of its rows."""
+    a, b, c = m[0, :], m[1, :], m[2, :]
+    adjugate = ca.vertcat(ca.cross(b, c), ca.cross(c, a), ca.cross(a, b)).T
+    return adjugate @ rhs / _determinant3(m)
+
+
+def robot_residual(robot: Robot, segments: int = 8, steps: int = 4, scheme: str = "rk4") -> Any:
+    """Weighted residual R(Y) of the whole robot, paper eq. (15)-(16), in physical units.
+
+    This is the text of the paper; the solver above works on the same equations rod by rod.
+
+    Returns
+    -------
+    casadi.Function
+        (Y, p (2), q (n)) -> R, both of n (4N - 1) + 2 entries. Y holds, rod after rod,
+        [n_x, n_y, m] of node 0 and [theta, n_x, n_y, m] of nodes 1 .. N-1 (N, N, N m, rad), then F [N].
+        R holds continuity, position (eq. 12), tip moment (eq. 14) per rod, then e_force. Weights: 1/L on
+        positions, L^2/EI on forces, L/EI on moments, 1 on angles.
+
+    Notes
+    -----
+    Sign: with eq. (3), n is the force applied *to* the rod's tip. Eq. (13) as printed, n_1 + n_2 + F = 0,
+    then makes F = -dU/dp, and the mass of eq. (7) would be pushed away from equilibrium. Here
+    e_force = sum n_i - F, so F = dU/dp is the force that holds the joint, and eq. (7) stands.
+    """
+    n = robot.n_rods
+    y = ca.SX.sym("Y", n * (4 * segments - 1) + 2)
+    p, q = ca.SX.sym("p", 2), ca.SX.sym("q", n)
+    force = y[-2:]
+    residuals: list[Any] = []
+    tip_forces = ca.SX(2, 1)
+    for i, rod in enumerate(robot.rods):
+        length, ei = rod.length, rod.bending_stiffness
+        units = ca.DM([1.0, ei / length**2, ei / length**2, ei / length])
+        mine = y[i * (4 * segments - 1) : (i + 1) * (4 * segments - 1)]
+        nodes = ca.reshape(ca.vertcat(q[i], mine), 4, segments)
+        ends = [propagation(steps, scheme)(nodes[:, j] / units, 1.0 / segments) for j in range(segments)]
+        for j in range(segments - 1):
+            residuals.append(ends[j][2:6] - nodes[:, j + 1] / units)
+        residuals.append(ca.DM(rod.base) / length + sum(end[:2] for end in ends) - p / length)
+        residuals.append(ends[-1][5])
+        tip_forces += ends[-1][3:5] * units[1]
+    mean_unit = float(np.mean(robot.stiffnesses / robot.lengths**2))
+    residuals.append((tip_forces - force) / mean_unit)
+    return ca.Function("robot_residual", [y, p, q], [ca.vertcat(*residuals)])

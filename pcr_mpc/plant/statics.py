@@ -1,0 +1,167 @@
+"""Statics of the robot with its tip held: (p, q) -> Equilibrium."""
+
+from __future__ import annotations
+
+import threading
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ..errors import ConvergenceError, checked_vector
+from .chart import held_shapes
+from .equilibrium import Equilibrium
+from .robot import Robot
+from .rod import SCHEMES, sample_rod
+from .rod_solver import RodSolver, Shooting
+from .single_shooting import solve_single_shooting
+
+# (steps per segment, scheme), tried in turn until the drift is small enough.
+_REFINEMENT = ((4, "rk4"), (4, "rk8"), (12, "rk8"))
+_WANTED_DRIFT = 1e-6
+METHODS = ("multiple_shooting", "single_shooting")
+
+
+def solve_statics(
+    robot: Robot,
+    p: Any,
+    q: Any,
+    *,
+    method: str = "multiple_shooting",
+    segments: int = 8,
+    steps: int | None = None,
+    scheme: str = "rk4",
+    guess: Equilibrium | np.ndarray | None = None,
+) -> Equilibrium:
+    """Static equilibrium of the rods for a held tip and given motor angles.
+
+    Parameters
+    ----------
+    robot : Robot
+    p : array_like, shape (2,)
+        Tip position in the world frame [m].
+    q : array_like, shape (n,)
+        Motor angles, counter-clockwise from world x [rad].
+    method : {"multiple_shooting", "single_shooting"}
+        Paper sec. 4, or the baseline of sec. 2, which uses segments * steps integration steps.
+    segments : int
+        Shooting segments per rod (N).
+    steps : int, optional
+        Runge-Kutta steps per segment. None: as many as bring the drift of the invariant below 1e-6 (the
+        relative error of F below 5e-5; typically 4 steps and 5e-6), up to 12 of order 8 for taut rods.
+    scheme : {"rk4", "rk8"}
+        Runge-Kutta scheme.
+    guess : Equilibrium or ndarray, optional
+        An equilibrium of this robot, whose branch is followed to (p, q); or nodes of shape (n, 4, N) from
+        which to iterate (see `Equilibrium.nodes`). None: each rod takes its stable shape of least energy.
+
+    Returns
+    -------
+    Equilibrium
+        Converged, and possibly unstable if a guess led there: see its ``stable``.
+
+    Raises
+    ------
+    UnreachableError
+        If |p - base_i| >= L_i for some rod i.
+    ConvergenceError
+        If the iteration did not reach the tolerance; carries the residual and the last iterate.
+    ValueError
+        Names an argument that is not finite or of the wrong shape.
+
+    References
+    ----------
+    .. [1] M. Rekkal, G. Ganesh, J. Cavalcanti Santos, "Towards Computationally Efficient Dynamic
+       Model of a Planar Parallel Continuum Robot".
+    """
+    p, q = checked_vector("p", p, 2), checked_vector("q", q, robot.n_rods)
+    robot.require_reachable(p)
+    if steps is None:
+        return _refined(robot, p, q, method, segments, guess)
+    shooting = checked_shooting(segments, steps, scheme)
+    if method == "multiple_shooting":
+        solver = _solver(robot, shooting, threading.get_ident())
+        if isinstance(guess, Equilibrium):
+            solver.start(guess.p, guess.q, _resampled(_of(robot, guess), segments))
+            solver.move(p, q)
+        else:
+            solver.start(p, q, None if guess is None else _checked_nodes(guess, robot, segments))
+        return solver.equilibrium(p, q)
+    if method == "single_shooting":
+        if guess is None:
+            nodes = np.stack([_cold_nodes(robot, i, p, q[i]) for i in range(robot.n_rods)])
+        else:
+            nodes = _of(robot, guess).nodes if isinstance(guess, Equilibrium) else np.asarray(guess, dtype=float)
+        return solve_single_shooting(robot, p, q, nodes, steps=segments * steps, scheme=scheme)
+    raise ValueError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
+
+
+def _refined(
+    robot: Robot,
+    p: np.ndarray,
+    q: np.ndarray,
+    method: str,
+    segments: int,
+    guess: Equilibrium | np.ndarray | None,
+) -> Equilibrium:
+    """Solve with finer and finer integration until the drift says that the rods are resolved."""
+    failure: ConvergenceError | None = None
+    for steps, scheme in _REFINEMENT:
+        try:
+            eq = solve_statics(robot, p, q, method=method, segments=segments, steps=steps, scheme=scheme, guess=guess)
+        except ConvergenceError as error:
+            failure = error
+            continue
+        if eq.drift <= _WANTED_DRIFT:
+            return eq
+        failure = ConvergenceError(
+            f"rods at p = {p} m, q = {q} rad are not resolved by {segments} segments of {steps} {scheme} steps: the "
+            f"invariant m^2/2 + n.t drifts by {eq.drift:.1e} along a rod (wanted {_WANTED_DRIFT:.0e}); "
+            "they are taut, use more segments",
+            residual=eq.residual_norm,
+            iterations=eq.iterations,
+            last=eq.nodes,
+        )
+    assert failure is not None
+    raise failure
+
+
+def checked_shooting(segments: int, steps: int, scheme: str) -> Shooting:
+    """Return the discretisation if it makes sense, or raise ValueError."""
+    if segments < 1 or steps < 1:
+        raise ValueError(f"segments = {segments} and steps = {steps} must be at least 1")
+    if scheme not in SCHEMES:
+        raise ValueError(f"scheme is {scheme!r}, expected one of {', '.join(SCHEMES)}")
+    return Shooting(int(segments), int(steps), scheme)
+
+
+@lru_cache(maxsize=32)
+def _solver(robot: Robot, shooting: Shooting, thread: int) -> RodSolver:
+    """One solver a thread: its buffers are shared memory."""
+    return RodSolver(robot, shooting)
+
+
+def _of(robot: Robot, guess: Equilibrium) -> Equilibrium:
+    if guess.robot.n_rods != robot.n_rods:
+        raise ValueError(f"guess has {guess.robot.n_rods} rods, the robot {robot.n_rods}")
+    return guess
+
+
+def _resampled(guess: Equilibrium, segments: int) -> np.ndarray:
+    if guess.nodes.shape[2] == segments:
+        return guess.nodes
+    return np.stack([sample_rod(nodes, segments + 1)[2:, :segments] for nodes in guess.nodes])
+
+
+def _checked_nodes(guess: np.ndarray, robot: Robot, segments: int) -> np.ndarray:
+    nodes = np.asarray(guess, dtype=float)
+    expected = (robot.n_rods, 4, segments)
+    if nodes.shape != expected or not np.isfinite(nodes).all():
+        raise ValueError(f"guess has shape {nodes.shape} (finite: {np.isfinite(nodes).all()}), expected {expected}")
+    return nodes
+
+
+def _cold_nodes(robot: Robot, i: int, p: np.ndarray, angle: float) -> np.ndarray:
+    x, y = (p - robot.rods[i].base) / robot.rods[i].length
+    cos, sin = np.cos(angle), np.sin(angle)
+    return held_shapes(cos * x + sin * y, cos * y - sin * x)[0].nodes(1, angle)

@@ -1,0 +1,135 @@
+"""Strict reading of TOML: every key is typed, and an unknown key is an error naming the nearest one."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from .errors import ModelError
+
+_REQUIRED: Any = object()
+
+
+class Table:
+    """One TOML table whose keys are taken one by one; what is left over is an error.
+
+    Use as a context manager: leaving it checks that no unknown key remains.
+    """
+
+    def __init__(self, path: Path, name: str, data: dict[str, Any]) -> None:
+        self.path = path
+        self.name = name
+        self._data = dict(data)
+        self._known: list[str] = []
+
+    def __enter__(self) -> Table:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None and self._data:
+            self._unknown(next(iter(self._data)))
+
+    def fail(self, key: str, problem: str, **details: Any) -> ModelError:
+        """Build the error that says what is wrong with ``key``."""
+        return ModelError(f"{self.path}: {self.name}{key}: {problem}", file=str(self.path), key=key, **details)
+
+    def _unknown(self, key: str) -> None:
+        nearest = difflib.get_close_matches(key, self._known, n=1, cutoff=0.0)
+        hint = f"did you mean {nearest[0]!r}?" if nearest else "no key is known here"
+        raise self.fail(key, f"unknown key; {hint} (known: {', '.join(self._known)})",
+                        nearest=nearest[0] if nearest else None)  # fmt: skip
+
+    def _take(self, key: str, default: Any) -> Any:
+        self._known.append(key)
+        if key in self._data:
+            return self._data.pop(key)
+        if default is _REQUIRED:
+            # A misspelt required key is both missing and unknown: name the misspelling.
+            for other in self._data:
+                if difflib.get_close_matches(other, [key], n=1, cutoff=0.75):
+                    raise self.fail(other, f"unknown key; did you mean {key!r}?", nearest=key)
+            raise self.fail(key, "missing")
+        return default
+
+    def number(
+        self,
+        key: str,
+        default: float = _REQUIRED,
+        *,
+        above: float = -math.inf,
+        minimum: float = -math.inf,
+    ) -> float:
+        """Take a finite number, greater than ``above`` and at least ``minimum``."""
+        value = self._take(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+            raise self.fail(key, f"expected a number, found {value!r}")
+        if not (value > above and value >= minimum) or (math.isinf(value) and value is not default):
+            bound = f"> {above}" if above > -math.inf else f">= {minimum}"
+            raise self.fail(key, f"is {value}, expected a finite number {bound}")
+        return float(value)
+
+    def integer(self, key: str, default: int = _REQUIRED, *, minimum: int = 1) -> int:
+        """Take an integer of at least ``minimum``."""
+        value = self._take(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
+            raise self.fail(key, f"expected an integer >= {minimum}, found {value!r}")
+        return value
+
+    def vector(self, key: str, size: int | None, default: Any = _REQUIRED) -> tuple[float, ...] | Any:
+        """Take a list of ``size`` finite numbers (any size if None)."""
+        value = self._take(key, default)
+        if value is default:
+            return default
+        if (
+            not isinstance(value, list)
+            or (size is not None and len(value) != size)
+            or not all(isinstance(v, int | float) and math.isfinite(v) for v in value)
+        ):
+            count = "" if size is None else f"{size} "
+            raise self.fail(key, f"expected a list of {count}finite numbers, found {value!r}")
+        return tuple(float(v) for v in value)
+
+    def text(self, key: str, default: Any = _REQUIRED, *, choices: tuple[str, ...] = ()) -> Any:
+        """Take a string, one of ``choices`` if given."""
+        value = self._take(key, default)
+        if value is default:
+            return default
+        if not isinstance(value, str) or (choices and value not in choices):
+            expected = f"one of {', '.join(choices)}" if choices else "a string"
+            raise self.fail(key, f"expected {expected}, found {value!r}")
+        return value
+
+    def table(self, key: str, default: Any = _REQUIRED) -> Table:
+        """Take a sub-table (pass ``default={}`` if it may be left out)."""
+        value = self._take(key, default)
+        if not isinstance(value, dict):
+            raise self.fail(key, f"expected a table, found {value!r}")
+        return Table(self.path, f"{self.name}{key}.", value)
+
+    def tables(self, key: str) -> list[Table]:
+        """Take a non-empty array of tables."""
+        value = self._take(key, _REQUIRED)
+        if not isinstance(value, list) or not value or not all(isinstance(v, dict) for v in value):
+            raise self.fail(key, f"expected [[{key}]] tables, found {value!r}")
+        return [Table(self.path, f"{self.name}{key}[{i}].", v) for i, v in enumerate(value)]
+
+
+def read_toml(path: str | Path) -> Table:
+    """Open a TOML file as the root table.
+
+    Raises
+    ------
+    ModelError
+        If the file is missing or is not TOML.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ModelError(f"{path}: no such file", file=str(path)) from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ModelError(f"{path}: {error}", file=str(path)) from error
+    return Table(path, "", data)
