@@ -21,7 +21,8 @@ class BufferedFunction:
     """
 
     def __init__(self, function: Any) -> None:
-        arguments = [ca.MX.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
+        symbol = ca.SX if function.is_a("SXFunction") else ca.MX
+        arguments = [symbol.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
         if not (_all_dense(function.sparsity_in, function.n_in())
                 and _all_dense(function.sparsity_out, function.n_out())):  # fmt: skip
             results = [ca.densify(result) for result in function.call(arguments)]

@@ -14,6 +14,7 @@ from .chart import held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod_solver import RodSolver, Shooting
+from .statics import resampled
 
 _MAX_ITERATIONS = 100
 _FORCE_TOLERANCE = 1e-9  # of the robot's force scale, sum EI/L^2
@@ -52,7 +53,7 @@ def forward_statics(
     q, force = checked_vector("q", q, robot.n_rods), checked_vector("force", force, 2)
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
-        solver.start(guess.p, guess.q, _nodes_of(guess, solver))
+        solver.start(guess.p, guess.q, resampled(guess, solver.shooting.segments))
         n_steps = int(np.ceil(np.abs(q - guess.q).max() / _ANGLE_STEP)) + 1
         p = guess.p
         for t in np.linspace(0.0, 1.0, n_steps + 1)[1:]:
@@ -107,7 +108,7 @@ def inverse_statics(
     robot.require_reachable(p)
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
-        solver.start(guess.p, guess.q, _nodes_of(guess, solver))
+        solver.start(guess.p, guess.q, resampled(guess, solver.shooting.segments))
         return solver.equilibrium(p, _reach(solver, guess, p, force))
     if mode is not None and (len(mode) != robot.n_rods or set(mode) - set("LR")):
         raise ValueError(f"mode is {mode!r}, expected {robot.n_rods} letters L or R")
@@ -161,7 +162,7 @@ def _settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) 
         while True:
             try:
                 robot.require_reachable(p + step)
-                solver.move(p + step, q)
+                solver.move(p + step, q, continuation=False)
                 trial = solver.energy() - force @ (p + step)
                 # Near the minimum the energy is flat to rounding: there the force must shrink instead.
                 if trial < energy or np.linalg.norm(np.array(solver.force()) - force) < 0.5 * np.linalg.norm(residual):
@@ -293,10 +294,6 @@ def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | No
 
 def _force_scale(robot: Robot) -> float:
     return float((robot.stiffnesses / robot.lengths**2).sum())
-
-
-def _nodes_of(guess: Equilibrium, solver: RodSolver) -> np.ndarray | None:
-    return guess.nodes if guess.nodes.shape[2] == solver.shooting.segments else None
 
 
 @lru_cache(maxsize=32)

@@ -15,6 +15,8 @@ from .multiple_shooting import rod_newton
 from .robot import Robot
 
 MAX_ITERATIONS = 60
+# A warm start that needs more is better served by a smaller sub-step.
+_WARM_ITERATIONS = 8
 # Residual at which a rod counts as solved, times 1 + its normalised force.
 TOLERANCE = 1e-10
 # A warm start that turns a node further than this beyond its prediction may have left its branch [rad].
@@ -45,6 +47,10 @@ class _NotConverged(Exception):
     def __init__(self, rod: int, residual: float, iterations: int, nodes: np.ndarray, reason: str) -> None:
         super().__init__(reason)
         self.rod, self.residual, self.iterations, self.nodes = rod, residual, iterations, nodes
+
+
+def _invariant_size(nodes: np.ndarray) -> float:
+    return 1.0 + math.hypot(nodes[1], nodes[2]) + nodes[3] ** 2 / 2
 
 
 def _length(step: np.ndarray, load: float) -> float:
@@ -117,7 +123,9 @@ class RodSolver:
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
 
-    def move(self, p: np.ndarray, q: np.ndarray, *, derivatives: float = TOLERANCE) -> None:
+    def move(
+        self, p: np.ndarray, q: np.ndarray, *, derivatives: float = TOLERANCE, continuation: bool = True
+    ) -> None:
         """Follow the branch from the last pose to (p, q).
 
         Parameters
@@ -125,6 +133,8 @@ class RodSolver:
         derivatives : float
             Greatest residual of the iterate at which the derivatives may have been taken. By default they
             belong to the solution itself; a simulation that needs the force alone saves an evaluation.
+        continuation : bool
+            False: give up where Newton's method fails, for a caller that shortens its own steps.
 
         Raises
         ------
@@ -133,7 +143,7 @@ class RodSolver:
         """
         poses = self._poses(p, q)
         try:
-            self._rods = [self._follow(i, pose, derivatives) for i, pose in enumerate(poses)]
+            self._rods = [self._follow(i, pose, derivatives, continuation) for i, pose in enumerate(poses)]
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
 
@@ -156,6 +166,10 @@ class RodSolver:
         """Rods with a conjugate point at the last pose."""
         return tuple(i for i, rod in enumerate(self._rods) if rod.scalars[2] > 0)
 
+    def drift(self) -> float:
+        """Largest change of the invariant m^2/2 + n . t along a rod, over its size."""
+        return max(abs(rod.scalars[3]) / _invariant_size(rod.nodes) for rod in self._rods)
+
     def jacobians(self) -> tuple[np.ndarray, np.ndarray]:
         """K (2, 2) [N/m] and G (2, n) [N/rad] at the last pose, by implicit differentiation."""
         k = np.zeros((2, 2))
@@ -172,7 +186,6 @@ class RodSolver:
         nodes = np.stack([rod.nodes.reshape((4, -1), order="F") for rod in self._rods])
         stiffness = np.stack([rod.stiffness for rod in self._rods])
         rod_forces = np.array(self._force_units)[:, None] * nodes[:, 1:3, -1]
-        size = 1.0 + np.hypot(nodes[:, 1, 0], nodes[:, 2, 0]) + nodes[:, 3, 0] ** 2 / 2
         return Equilibrium(
             robot=self.robot,
             p=np.array(p),
@@ -189,7 +202,7 @@ class RodSolver:
             nodes=nodes,
             residual_norm=math.hypot(*(rod.residual for rod in self._rods)),
             iterations=max(rod.iterations for rod in self._rods),
-            drift=float(np.max(np.abs([rod.scalars[3] for rod in self._rods]) / size)),
+            drift=self.drift(),
             unstable_rods=self.unstable_rods(),
         )
 
@@ -200,11 +213,13 @@ class RodSolver:
             for rod, scale, angle in zip(self.robot.rods, self._inverse_lengths, q, strict=True)
         ]
 
-    def _follow(self, i: int, pose: np.ndarray, derivatives: float) -> _RodState:
+    def _follow(self, i: int, pose: np.ndarray, derivatives: float, continuation: bool) -> _RodState:
         start = self._rods[i]
         try:
             return self._predict(i, start, pose, derivatives)
         except _NotConverged as failure:
+            if not continuation:
+                raise
             first = failure
         # Continuation along the straight line from the last pose, sub-steps halved and doubled as they go.
         state, done, substep = start, 0.0, 0.5
@@ -222,7 +237,7 @@ class RodSolver:
 
     def _predict(self, i: int, start: _RodState, pose: np.ndarray, derivatives: float) -> _RodState:
         predicted = start.nodes + start.tangent @ (pose - start.pose)
-        state = self._solve(i, pose, predicted.copy(), derivatives)
+        state = self._solve(i, pose, predicted.copy(), derivatives, _WARM_ITERATIONS)
         if np.abs(state.nodes[0::4] - predicted[0::4]).max() > _BRANCH_ANGLE:
             raise _NotConverged(i, state.residual, state.iterations, state.nodes, "left its branch")
         return state
@@ -244,7 +259,9 @@ class RodSolver:
         raise last
 
     @np.errstate(all="ignore")  # an overflow is a bad trial point, and rejected
-    def _solve(self, i: int, pose: np.ndarray, nodes: np.ndarray, derivatives: float) -> _RodState:
+    def _solve(
+        self, i: int, pose: np.ndarray, nodes: np.ndarray, derivatives: float, most: int = MAX_ITERATIONS
+    ) -> _RodState:
         """Damped Newton from ``nodes``.
 
         A step is kept if the next Newton step is shorter or the residual smaller. The residual alone will not
@@ -259,7 +276,7 @@ class RodSolver:
         newton.inputs[0][:] = nodes
         newton()
         residual = newton.outputs[3][0]
-        for iteration in range(1, MAX_ITERATIONS + 1):
+        for iteration in range(1, most + 1):
             if residual <= tolerance:
                 return self._state(pose, nodes, residual, iteration)
             if residual <= derivatives:
@@ -285,7 +302,7 @@ class RodSolver:
                 if size < 1e-3:
                     raise _NotConverged(i, residual, iteration, nodes, "no descent")
             nodes, residual = trial, trial_residual
-        raise _NotConverged(i, residual, MAX_ITERATIONS, nodes, "too many iterations")
+        raise _NotConverged(i, residual, most, nodes, "too many iterations")
 
     def _state(self, pose: np.ndarray, nodes: np.ndarray, residual: float, iterations: int) -> _RodState:
         _, tangent, stiffness, scalars = self._newton.outputs

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from ..buffered import BufferedFunction
 from ..errors import ConvergenceError
+from .chart import held_shapes
 from .equilibrium import Equilibrium
 from .multiple_shooting import rod_newton, robot_residual
 from .robot import Robot
@@ -27,98 +28,131 @@ def _residual_and_jacobians(robot: Robot, steps: int, scheme: str) -> Any:
     return ca.Function("single_shooting", [y, p, q], [r, ca.jacobian(r, y), ca.jacobian(r, ca.vertcat(p, q))])
 
 
-def solve_single_shooting(
-    robot: Robot, p: np.ndarray, q: np.ndarray, nodes: np.ndarray, *, steps: int = 32, scheme: str = "rk4"
-) -> Equilibrium:
-    """Solve eq. (5)-(6): the base loads of every rod and the joint force, 3n + 2 unknowns (8 for two rods).
+class SingleShooting:
+    """Eq. (5)-(6): the base loads of every rod and the joint force, 3n + 2 unknowns (8 for two rods).
+
+    Same calls as `RodSolver`: it remembers the last pose as the next guess.
 
     Parameters
     ----------
-    nodes : ndarray, shape (n, 4, N)
-        Guess; only the states at the base are used (see `Equilibrium.nodes`).
+    robot : Robot
     steps : int
         Runge-Kutta steps along the whole rod.
-
-    Raises
-    ------
-    ConvergenceError
-        Levenberg-Marquardt stopped with a weighted residual above 1e-8.
+    scheme : {"rk4", "rk8"}
+        Runge-Kutta scheme.
     """
-    n = robot.n_rods
-    evaluate = BufferedFunction(_residual_and_jacobians(robot, steps, scheme))
-    evaluate.inputs[1][:], evaluate.inputs[2][:] = p, q
-    units = np.stack([robot.stiffnesses / robot.lengths**e for e in (2, 2, 1)], axis=1)
-    loads = nodes[:, 1:, 0] * units
-    guess = np.concatenate([loads.ravel(), loads[:, :2].sum(axis=0)])
-    scale = np.concatenate([units.ravel(), np.full(2, units[:, 0].mean())])
 
-    def residual(y: np.ndarray) -> np.ndarray:
-        evaluate.inputs[0][:] = y
-        evaluate()
-        return evaluate.outputs[0].copy()
+    def __init__(self, robot: Robot, steps: int = 32, scheme: str = "rk4") -> None:
+        self.robot = robot
+        self._evaluate = BufferedFunction(_residual_and_jacobians(robot, steps, scheme))
+        self._units = np.stack([robot.stiffnesses / robot.lengths**e for e in (2, 2, 1)], axis=1)
+        # Energy and conjugate points need states along the rod: they are judged on eight nodes.
+        self._judge, _ = rod_newton(8, 4, "rk8")
+        self._last: Equilibrium | None = None
 
-    def jacobian(y: np.ndarray) -> np.ndarray:
-        residual(y)
-        return evaluate.outputs[1].copy()
+    def start(self, p: np.ndarray, q: np.ndarray, nodes: np.ndarray | None = None) -> None:
+        """Solve at (p, q) from the base states of ``nodes``, shape (n, 4, N), or cold (None)."""
+        self._last = self._solve(p, q, np.stack(self._cold(p, q)) if nodes is None else nodes)
 
-    # An overflow on the way is a bad trial point, which the solver rejects; the verdict is below.
-    with np.errstate(all="ignore"):
-        try:
-            fit = least_squares(
-                residual, guess, jacobian, method="lm", x_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-15
+    def move(self, p: np.ndarray, q: np.ndarray, *, derivatives: float = 0.0) -> None:
+        """Solve at (p, q) from the last pose. The derivatives always belong to the solution."""
+        assert self._last is not None
+        self._last = self._solve(p, q, self._last.nodes)
+
+    def force(self) -> tuple[float, float]:
+        """F at the last pose [N]."""
+        f_x, f_y = self._solution().force
+        return f_x, f_y
+
+    def jacobians(self) -> tuple[np.ndarray, np.ndarray]:
+        """K (2, 2) [N/m] and G (2, n) [N/rad] at the last pose."""
+        eq = self._solution()
+        return eq.dforce_dp, eq.dforce_dq
+
+    def unstable_rods(self) -> tuple[int, ...]:
+        """Rods with a conjugate point at the last pose."""
+        return self._solution().unstable_rods
+
+    def drift(self) -> float:
+        """Largest change of the invariant m^2/2 + n . t along a rod, over its size."""
+        return self._solution().drift
+
+    def equilibrium(self, p: np.ndarray, q: np.ndarray) -> Equilibrium:
+        """Everything about the last pose, which was solved at (p, q)."""
+        return self._solution()
+
+    def _solution(self) -> Equilibrium:
+        assert self._last is not None
+        return self._last
+
+    def _cold(self, p: np.ndarray, q: np.ndarray) -> list[np.ndarray]:
+        nodes = []
+        for rod, angle in zip(self.robot.rods, q, strict=True):
+            x, y = (p - rod.base) / rod.length
+            cos, sin = np.cos(angle), np.sin(angle)
+            xi, eta = cos * x + sin * y, cos * y - sin * x
+            coarse = held_shapes(xi, eta)[0]
+            nodes.append((coarse.polished(xi, eta) or coarse).nodes(1, angle))
+        return nodes
+
+    def _solve(self, p: np.ndarray, q: np.ndarray, nodes: np.ndarray) -> Equilibrium:
+        n, evaluate, units = self.robot.n_rods, self._evaluate, self._units
+        evaluate.inputs[1][:], evaluate.inputs[2][:] = p, q
+        loads = nodes[:, 1:, 0] * units
+        guess = np.concatenate([loads.ravel(), loads[:, :2].sum(axis=0)])
+        scale = np.concatenate([units.ravel(), np.full(2, units[:, 0].mean())])
+
+        def residual(y: np.ndarray) -> np.ndarray:
+            evaluate.inputs[0][:] = y
+            evaluate()
+            return evaluate.outputs[0].copy()
+
+        def jacobian(y: np.ndarray) -> np.ndarray:
+            residual(y)
+            return evaluate.outputs[1].copy()
+
+        # An overflow on the way is a bad trial point, which the solver rejects; the verdict is below.
+        with np.errstate(all="ignore"):
+            try:
+                fit = least_squares(
+                    residual, guess, jacobian, method="lm", x_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-15
+                )
+                y, evaluations = fit.x, int(fit.nfev)
+            except ValueError:  # SciPy's word for a non-finite residual
+                y, evaluations = guess, 1
+            norm = float(np.linalg.norm(residual(y)))
+        if not norm <= _ACCEPTED_RESIDUAL:
+            raise ConvergenceError(
+                f"single shooting at p = {p} m, q = {q} rad stopped with residual {norm:.2e} after {evaluations} "
+                "evaluations; pass a closer guess or use method='multiple_shooting'",
+                residual=norm,
+                iterations=evaluations,
+                last=y,
             )
-            y, evaluations = fit.x, int(fit.nfev)
-        except ValueError:  # SciPy's word for a non-finite residual
-            y, evaluations = guess, 1
-    norm = float(np.linalg.norm(residual(y)))
-    if not norm <= _ACCEPTED_RESIDUAL:
-        raise ConvergenceError(
-            f"single shooting at p = {p} m, q = {q} rad stopped with residual {norm:.2e} after {evaluations} "
-            "evaluations; pass a closer guess or use method='multiple_shooting'",
-            residual=norm,
+        # Implicit function theorem: dY/d(p, q) = -(dR/dY)^-1 dR/d(p, q), one factorisation for all columns.
+        sensitivity = -np.linalg.solve(evaluate.outputs[1], evaluate.outputs[2])
+        base_loads = y[:-2].reshape(n, 3)
+        solved = np.concatenate([q[:, None], base_loads / units], axis=1)[:, :, None]
+        scalars = np.empty((n, 4))
+        for i, rod in enumerate(self.robot.rods):
+            sampled = sample_rod(solved[i], 9)[2:, :8]
+            scalars[i] = self._judge(sampled.ravel(order="F"), (p - rod.base) / rod.length)[3].full().ravel()
+        size = 1.0 + np.hypot(solved[:, 1, 0], solved[:, 2, 0]) + solved[:, 3, 0] ** 2 / 2
+        return Equilibrium(
+            robot=self.robot,
+            p=p.copy(),
+            q=q.copy(),
+            method="single_shooting",
+            force=y[-2:].copy(),
+            dforce_dp=sensitivity[-2:, :2].copy(),
+            dforce_dq=sensitivity[-2:, 2:].copy(),
+            motor_torque=-base_loads[:, 2],
+            dtorque_dq=-np.diagonal(sensitivity[2:-2:3, 2:]).copy(),
+            energy=float((self.robot.stiffnesses / self.robot.lengths) @ scalars[:, 1]),
+            rod_forces=base_loads[:, :2].copy(),
+            nodes=solved,
+            residual_norm=norm,
             iterations=evaluations,
-            last=y,
+            drift=float(np.max(np.abs(scalars[:, 3]) / size)),
+            unstable_rods=tuple(int(i) for i in np.flatnonzero(scalars[:, 2] > 0)),
         )
-    # Implicit function theorem: dY/d(p, q) = -(dR/dY)^-1 dR/d(p, q), one factorisation for all columns.
-    sensitivity = -np.linalg.solve(evaluate.outputs[1], evaluate.outputs[2])
-    base_loads = y[:-2].reshape(n, 3)
-    solved = np.concatenate([q[:, None], base_loads / units], axis=1)[:, :, None]
-    return _equilibrium(robot, p, q, solved, y[-2:], sensitivity, norm, evaluations)
-
-
-def _equilibrium(
-    robot: Robot,
-    p: np.ndarray,
-    q: np.ndarray,
-    nodes: np.ndarray,
-    force: np.ndarray,
-    sensitivity: np.ndarray,
-    norm: float,
-    evaluations: int,
-) -> Equilibrium:
-    # Energy and conjugate points need states along the rod: judge them on eight nodes.
-    newton, _ = rod_newton(8, 4, "rk8")
-    moment_units = robot.stiffnesses / robot.lengths
-    scalars = np.empty((robot.n_rods, 4))
-    for i, rod in enumerate(robot.rods):
-        sampled = sample_rod(nodes[i], 9)[2:, :8]
-        scalars[i] = newton(sampled.ravel(order="F"), (p - rod.base) / rod.length)[3].full().ravel()
-    size = 1.0 + np.hypot(nodes[:, 1, 0], nodes[:, 2, 0]) + nodes[:, 3, 0] ** 2 / 2
-    return Equilibrium(
-        robot=robot,
-        p=p.copy(),
-        q=q.copy(),
-        method="single_shooting",
-        force=force.copy(),
-        dforce_dp=sensitivity[-2:, :2].copy(),
-        dforce_dq=sensitivity[-2:, 2:].copy(),
-        motor_torque=-moment_units * nodes[:, 3, 0],
-        dtorque_dq=-np.diagonal(sensitivity[2:-2:3, 2:]).copy(),
-        energy=float(moment_units @ scalars[:, 1]),
-        rod_forces=nodes[:, 1:3, 0] * (robot.stiffnesses / robot.lengths**2)[:, None],
-        nodes=nodes,
-        residual_norm=norm,
-        iterations=evaluations,
-        drift=float(np.max(np.abs(scalars[:, 3]) / size)),
-        unstable_rods=tuple(int(i) for i in np.flatnonzero(scalars[:, 2] > 0)),
-    )

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConvergenceError, checked_vector
-from .chart import held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod import SCHEMES, sample_rod
 from .rod_solver import RodSolver, Shooting
-from .single_shooting import solve_single_shooting
+from .single_shooting import SingleShooting
 
 # (steps per segment, scheme), tried in turn until the drift is small enough.
 _REFINEMENT = ((4, "rk4"), (4, "rk8"), (12, "rk8"))
@@ -79,21 +78,13 @@ def solve_statics(
     if steps is None:
         return _refined(robot, p, q, method, segments, guess)
     shooting = checked_shooting(segments, steps, scheme)
-    if method == "multiple_shooting":
-        solver = _solver(robot, shooting, threading.get_ident())
-        if isinstance(guess, Equilibrium):
-            solver.start(guess.p, guess.q, _resampled(_of(robot, guess), segments))
-            solver.move(p, q)
-        else:
-            solver.start(p, q, None if guess is None else _checked_nodes(guess, robot, segments))
-        return solver.equilibrium(p, q)
-    if method == "single_shooting":
-        if guess is None:
-            nodes = np.stack([_cold_nodes(robot, i, p, q[i]) for i in range(robot.n_rods)])
-        else:
-            nodes = _of(robot, guess).nodes if isinstance(guess, Equilibrium) else np.asarray(guess, dtype=float)
-        return solve_single_shooting(robot, p, q, nodes, steps=segments * steps, scheme=scheme)
-    raise ValueError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
+    solver = _solver(robot, method, shooting, threading.get_ident())
+    if isinstance(guess, Equilibrium):
+        solver.start(guess.p, guess.q, resampled(_of(robot, guess), segments))
+        solver.move(p, q)
+    else:
+        solver.start(p, q, None if guess is None else _checked_nodes(guess, robot, segments))
+    return solver.equilibrium(p, q)
 
 
 def _refined(
@@ -136,9 +127,18 @@ def checked_shooting(segments: int, steps: int, scheme: str) -> Shooting:
 
 
 @lru_cache(maxsize=32)
-def _solver(robot: Robot, shooting: Shooting, thread: int) -> RodSolver:
+def _solver(robot: Robot, method: str, shooting: Shooting, thread: int) -> RodSolver | SingleShooting:
     """One solver a thread: its buffers are shared memory."""
-    return RodSolver(robot, shooting)
+    return make_solver(robot, method, shooting)
+
+
+def make_solver(robot: Robot, method: str, shooting: Shooting) -> RodSolver | SingleShooting:
+    """Build the solver that goes by the name ``method``."""
+    if method == "multiple_shooting":
+        return RodSolver(robot, shooting)
+    if method == "single_shooting":
+        return SingleShooting(robot, shooting.segments * shooting.steps, shooting.scheme)
+    raise ValueError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
 
 
 def _of(robot: Robot, guess: Equilibrium) -> Equilibrium:
@@ -147,7 +147,8 @@ def _of(robot: Robot, guess: Equilibrium) -> Equilibrium:
     return guess
 
 
-def _resampled(guess: Equilibrium, segments: int) -> np.ndarray:
+def resampled(guess: Equilibrium, segments: int) -> np.ndarray:
+    """Nodes of an equilibrium at another number of segments, shape (n, 4, segments)."""
     if guess.nodes.shape[2] == segments:
         return guess.nodes
     return np.stack([sample_rod(nodes, segments + 1)[2:, :segments] for nodes in guess.nodes])
@@ -159,9 +160,3 @@ def _checked_nodes(guess: np.ndarray, robot: Robot, segments: int) -> np.ndarray
     if nodes.shape != expected or not np.isfinite(nodes).all():
         raise ValueError(f"guess has shape {nodes.shape} (finite: {np.isfinite(nodes).all()}), expected {expected}")
     return nodes
-
-
-def _cold_nodes(robot: Robot, i: int, p: np.ndarray, angle: float) -> np.ndarray:
-    x, y = (p - robot.rods[i].base) / robot.rods[i].length
-    cos, sin = np.cos(angle), np.sin(angle)
-    return held_shapes(cos * x + sin * y, cos * y - sin * x)[0].nodes(1, angle)

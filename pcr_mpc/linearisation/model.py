@@ -1,0 +1,124 @@
+"""The linear model that a controller predicts with: x+ = A x + B u + c."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import control
+import numpy as np
+
+from ..buffered import BufferedFunction
+from ..errors import checked_vector
+from ..plant.dynamics import Plant
+
+# Taylor order and squarings of the matrix exponential: 1e-11 at K dt^2/m = 4, rounding below 1.
+_TAYLOR_ORDER, _SQUARINGS = 8, 4
+# Residual of the statics at which K and G may be taken; their error is of this size.
+_DERIVATIVE_ACCURACY = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """Affine discrete-time model x+ = A x + B u + c with x = [p, v, q] and u held over dt.
+
+    Attributes
+    ----------
+    A : ndarray, shape (4 + n, 4 + n)
+    B : ndarray, shape (4 + n, n)
+    c : ndarray, shape (4 + n,)
+    dt : float
+        Period [s].
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    c: np.ndarray
+    dt: float
+
+    def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Predict the next state."""
+        return np.asarray(self.A @ x + self.B @ u + self.c)
+
+    def to_control(self) -> Any:
+        """Return the linear part as a `control.StateSpace` with the tip position as output."""
+        n_states, n_inputs = self.B.shape
+        output = np.eye(2, n_states)
+        return control.ss(self.A, self.B, output, np.zeros((2, n_inputs)), self.dt)
+
+
+def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) -> LinearModel:
+    """Linear model of the plant about a state, which need not be in balance.
+
+    The rods' force is replaced by F + K dp + G dq with K = dF/dp, G = dF/dq from implicit differentiation
+    of the statics; the resulting affine system m p'' + c p' = -F - K dp - G dq + f_ext, q' = u is
+    discretised exactly for inputs held over dt (matrix exponential, not an integrator's step).
+
+    Parameters
+    ----------
+    plant : Plant
+        Follows its branch to x.
+    x : array_like, shape (4 + n,)
+        State [m, m/s, rad].
+    u : array_like, shape (n,)
+        Input [rad/s]. The plant is affine in u, so the model does not depend on it; it is checked only.
+    dt : float
+        Period of the model [s], usually the control period.
+    f_ext : array_like, shape (2,)
+        External force that the model assumes [N].
+
+    Raises
+    ------
+    UnreachableError, ConvergenceError, UnstableError
+        As `Plant.step`.
+    """
+    x = checked_vector("x", x, plant.n_states)
+    checked_vector("u", u, plant.robot.n_rods)
+    f_ext = checked_vector("f_ext", f_ext, 2)
+    force, k, g = plant.force_and_jacobians(x[:2], x[4:], _DERIVATIVE_ACCURACY)
+    function = _discretisation(plant.robot.n_rods, threading.get_ident())
+    function.inputs[0][:] = k
+    function.inputs[1][:] = g
+    function.inputs[2][:] = force - f_ext
+    function.inputs[3][:] = x
+    function.inputs[4][:] = plant.robot.tip_mass, plant.robot.drag, dt
+    function()
+    return LinearModel(*(output.copy() for output in function.outputs), dt)
+
+
+@lru_cache(maxsize=32)
+def _discretisation(n: int, thread: int) -> BufferedFunction:
+    """Exact discretisation as one graph: (K, G, F - F_ext, x, [m, c, dt]) -> (A, B, c)."""
+    k, g, force = ca.SX.sym("K", 2, 2), ca.SX.sym("G", 2, n), ca.SX.sym("F", 2)
+    x, parameters = ca.SX.sym("x", 4 + n), ca.SX.sym("parameters", 3)
+    mass, drag, dt = ca.vertsplit(parameters)
+    p, q = x[:2], x[4:]
+
+    # d/dtau [dp, dv dt, q, u dt, 1] with tau = t/dt in [0, 1]: every entry is dimensionless or small, and
+    # the constant column holds the force at the point of linearisation.
+    scale = dt * dt / mass
+    constant = -scale * (force - ca.mtimes(k, p) - ca.mtimes(g, q))
+    size = 4 + 2 * n + 1
+    generator = ca.SX(size, size)
+    generator[0:2, 2:4] = ca.SX.eye(2)
+    generator[2:4, 0:2] = -scale * k
+    generator[2:4, 2:4] = -(dt * drag / mass) * ca.SX.eye(2)
+    generator[2:4, 4 : 4 + n] = -scale * g
+    generator[2:4, -1] = constant
+    generator[4 : 4 + n, 4 + n : 4 + 2 * n] = ca.SX.eye(n)
+
+    scaled = generator / 2**_SQUARINGS
+    exponential = ca.SX.eye(size)
+    for order in range(_TAYLOR_ORDER, 0, -1):
+        exponential = ca.SX.eye(size) + ca.mtimes(scaled, exponential) / order
+    for _ in range(_SQUARINGS):
+        exponential = ca.mtimes(exponential, exponential)
+
+    units = ca.vertcat(1, 1, 1 / dt, 1 / dt, ca.SX.ones(n))
+    rows = ca.diag(units) @ exponential[: 4 + n, :]
+    a = rows[:, : 4 + n] @ ca.diag(1 / units)
+    b = rows[:, 4 + n : 4 + 2 * n] * dt
+    return BufferedFunction(ca.Function("discretise", [k, g, force, x, parameters], [a, b, rows[:, -1]], {"cse": True}))

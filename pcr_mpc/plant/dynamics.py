@@ -1,0 +1,204 @@
+"""The plant: a point mass at the joint on quasi-static rods, paper eq. (7)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
+from .equilibrium import Equilibrium
+from .robot import Robot
+from .rod_solver import TOLERANCE
+from .statics import checked_shooting, make_solver, resampled
+
+# A simulation uses the derivatives only to predict the next pose.
+_PREDICTOR_ACCURACY = 1e-2
+# Relative drift of a rod's invariant at which its force is off by a few per cent.
+_LARGEST_DRIFT = 1e-3
+
+
+class Plant:
+    """The robot in motion: m p'' + c p' = -F(p, q) + F_ext, motor angles driven by their rates.
+
+    The state is x = [p (2), v (2), q (n)] in [m, m/s, rad], the input u = q' (n) in rad/s.
+
+    Parameters
+    ----------
+    robot : Robot
+    method : {"multiple_shooting", "single_shooting"}
+        Statics of the rods.
+    segments, steps, scheme
+        Discretisation, see `solve_statics`.
+    integrator : {"semi_implicit_euler", "velocity_verlet", "rk4"}
+        The paper's first-order scheme, a second-order one, both with one force evaluation a step, and the
+        classical fourth-order one with four.
+    dt : float
+        Step [s].
+
+    Notes
+    -----
+    A state does not say on which branch the rods are, so the plant follows them by continuity from one call
+    to the next; `reset` starts elsewhere. Motors saturate: rates are clipped to the limit and angles stop at
+    theirs. (The limit on the change of rate concerns commands, and is the controller's.)
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        method: str = "multiple_shooting",
+        segments: int = 8,
+        steps: int = 4,
+        scheme: str = "rk4",
+        integrator: str = "semi_implicit_euler",
+        dt: float = 1e-3,
+    ) -> None:
+        if integrator not in INTEGRATORS:
+            raise ValueError(f"integrator is {integrator!r}, expected one of {', '.join(INTEGRATORS)}")
+        if not 0.0 < dt < np.inf:
+            raise ValueError(f"dt is {dt} s, expected a positive number")
+        self.robot = robot
+        self.method = method
+        self.integrator = integrator
+        self.dt = dt
+        self._segments = segments
+        self.n_states = 4 + robot.n_rods
+        self._advance = INTEGRATORS[integrator]
+        self._solver = make_solver(robot, method, checked_shooting(segments, steps, scheme))
+        self._at: tuple[float, ...] | None = None
+        self._lower, self._upper = robot.angle_limits.T.copy()
+
+    def reset(self, x: Any, guess: Equilibrium | None = None) -> None:
+        """Put the rods on the branch of ``guess`` at state x, or on the branch of least energy (None)."""
+        x = checked_vector("x", x, self.n_states)
+        p, q = x[:2], x[4:]
+        self.robot.require_reachable(p)
+        if guess is None:
+            self._solver.start(p, q)
+        else:
+            self._solver.start(guess.p, guess.q, resampled(guess, self._segments))
+            self._solver.move(p, q)
+        self._at = (*p.tolist(), *q.tolist())
+
+    def step(self, x: Any, u: Any, f_ext: Any = (0.0, 0.0)) -> np.ndarray:
+        """Advance by one time step with the motor rates held.
+
+        Parameters
+        ----------
+        x : array_like, shape (4 + n,)
+            State [m, m/s, rad].
+        u : array_like, shape (n,)
+            Motor rates [rad/s].
+        f_ext : array_like, shape (2,)
+            External force on the tip [N].
+
+        Returns
+        -------
+        ndarray, shape (4 + n,)
+
+        Raises
+        ------
+        UnreachableError, ConvergenceError, UnstableError
+            The rods could not follow; the exception carries the ``state`` at the start of the step.
+        """
+        x = checked_vector("x", x, self.n_states)
+        u = checked_vector("u", u, self.robot.n_rods)
+        f_ext = checked_vector("f_ext", f_ext, 2)
+        limit = self.robot.rate_limit
+        rate = np.minimum(np.maximum(u, -limit), limit)
+        # A motor that would pass its stop within the step arrives there at the end of it.
+        rate = (np.minimum(np.maximum(x[4:] + self.dt * rate, self._lower), self._upper) - x[4:]) / self.dt
+        try:
+            return self._advance(self, x, rate, f_ext)
+        except PCRError as error:
+            error.details["state"] = x.copy()
+            raise
+
+    def force(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """F at (p, q), following the branch [N]."""
+        self._go(p, q, _PREDICTOR_ACCURACY)
+        return np.array(self._solver.force())
+
+    def force_and_jacobians(
+        self, p: np.ndarray, q: np.ndarray, accuracy: float = TOLERANCE
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """F [N], K [N/m] and G [N/rad] at (p, q), following the branch.
+
+        ``accuracy`` bounds the residual of the iterate at which K and G were taken.
+        """
+        self._at = None  # the last solve may have been content with rougher derivatives
+        self._go(p, q, accuracy)
+        return np.array(self._solver.force()), *self._solver.jacobians()
+
+    def equilibrium(self, x: Any) -> Equilibrium:
+        """Everything about the rods at state x, following the branch."""
+        x = checked_vector("x", x, self.n_states)
+        self._at = None
+        self._go(x[:2], x[4:], TOLERANCE)
+        return self._solver.equilibrium(x[:2], x[4:])
+
+    def _go(self, p: np.ndarray, q: np.ndarray, derivatives: float) -> None:
+        at = (*p.tolist(), *q.tolist())
+        if at == self._at:
+            return
+        self.robot.require_reachable(p)
+        self._at = None
+        self._solver.move(p, q, derivatives=derivatives)
+        unstable = self._solver.unstable_rods()
+        if unstable:
+            raise UnstableError(
+                f"rod {unstable[0]} is unstable at p = {p} m, q = {q} rad: it would snap to another shape; "
+                "slow down or keep away from this pose",
+                rod=unstable[0],
+            )
+        drift = self._solver.drift()
+        if not drift <= _LARGEST_DRIFT:
+            raise ConvergenceError(
+                f"the rods at p = {p} m, q = {q} rad are too taut for this discretisation: their invariant drifts by "
+                f"{drift:.1e} (at most {_LARGEST_DRIFT:.0e}); use more segments or steps",
+                residual=drift,
+                iterations=0,
+                last=None,
+            )
+        self._at = at
+
+    def _acceleration(self, p: np.ndarray, v: np.ndarray, q: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
+        return (f_ext - self.force(p, q) - self.robot.drag * v) / self.robot.tip_mass
+
+
+def _semi_implicit_euler(plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
+    p, v, q = x[:2], x[2:4], x[4:]
+    v = v + plant.dt * plant._acceleration(p, v, q, f_ext)
+    return np.concatenate([p + plant.dt * v, v, q + plant.dt * rate])
+
+
+def _velocity_verlet(plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
+    # Half a kick with implicit drag, drift, half a kick with explicit drag: each the adjoint of the other,
+    # hence symmetric and of second order; the force at the end is the next step's first.
+    p, v, q, dt = x[:2], x[2:4], x[4:], plant.dt
+    half, damping = dt / (2 * plant.robot.tip_mass), dt * plant.robot.drag / (2 * plant.robot.tip_mass)
+    v = (v + half * (f_ext - plant.force(p, q))) / (1.0 + damping)
+    p, q = p + dt * v, q + dt * rate
+    v = (1.0 - damping) * v + half * (f_ext - plant.force(p, q))
+    return np.concatenate([p, v, q])
+
+
+def _rk4(plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
+    def slope(y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[2:4], plant._acceleration(y[:2], y[2:4], y[4:], f_ext), rate])
+
+    dt = plant.dt
+    k1 = slope(x)
+    k2 = slope(x + dt / 2 * k1)
+    k3 = slope(x + dt / 2 * k2)
+    k4 = slope(x + dt * k3)
+    return np.asarray(x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+
+
+INTEGRATORS: dict[str, Callable[[Plant, np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
+    "semi_implicit_euler": _semi_implicit_euler,
+    "velocity_verlet": _velocity_verlet,
+    "rk4": _rk4,
+}
