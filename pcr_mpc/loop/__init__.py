@@ -1,0 +1,1 @@
+"""Scenes, closed-loop simulation and its record."""

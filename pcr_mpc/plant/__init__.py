@@ -1,0 +1,1 @@
+"""The robot: rods, statics and dynamics."""

@@ -1,0 +1,59 @@
+"""Model-predictive control of planar parallel continuum robots."""
+
+from .control.mpc import LinearMPC, Plan
+from .control.qp import QuadraticProgram, Reference, build_qp
+from .control.tuning import Limits, Tuning, load_tuning
+from .errors import (
+    ConvergenceError,
+    InfeasibleError,
+    ModelError,
+    PCRError,
+    SimulationError,
+    UnreachableError,
+    UnstableError,
+)
+from .linearisation.model import LinearModel, linearise
+from .loop.controllers import HoldMotors, TrackingMPC, make_controller
+from .loop.run import Run
+from .loop.scene import Scene, load_scene
+from .loop.simulate import simulate
+from .plant.dynamics import Plant
+from .plant.equilibrium import Equilibrium
+from .plant.free_tip import forward_statics, inverse_statics
+from .plant.robot import Robot, Rod, load_robot
+from .plant.statics import solve_statics
+
+__all__ = [
+    "ConvergenceError",
+    "Equilibrium",
+    "HoldMotors",
+    "InfeasibleError",
+    "Limits",
+    "LinearMPC",
+    "LinearModel",
+    "ModelError",
+    "PCRError",
+    "Plan",
+    "Plant",
+    "QuadraticProgram",
+    "Reference",
+    "Robot",
+    "Rod",
+    "Run",
+    "Scene",
+    "SimulationError",
+    "TrackingMPC",
+    "Tuning",
+    "UnreachableError",
+    "UnstableError",
+    "build_qp",
+    "forward_statics",
+    "inverse_statics",
+    "linearise",
+    "load_robot",
+    "load_scene",
+    "load_tuning",
+    "make_controller",
+    "simulate",
+    "solve_statics",
+]

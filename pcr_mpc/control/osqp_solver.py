@@ -1,0 +1,164 @@
+"""OSQP behind calls that cannot fail silently.
+
+OSQP's own ``update`` drops the return code, misreads strided arrays, keeps old data when something is wrong and
+still says "solved"; one NaN poisons later solves; the x of an unsolved problem is a number. Here every array is
+checked before it is handed over, every return code is read, and x exists only if the problem was solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import osqp
+import scipy.sparse as sp
+
+from ..errors import InfeasibleError
+
+_RHO = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A solved QP.
+
+    Attributes
+    ----------
+    x : ndarray, shape (n,)
+    y : ndarray, shape (m,)
+        Multipliers, positive at upper bounds.
+    iterations : int
+    primal_residual, dual_residual : float
+        Largest violation of l <= A x <= u, and largest entry of P x + q + A'y, computed here from the data.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    iterations: int
+    primal_residual: float
+    dual_residual: float
+
+
+class QPSolver:
+    """One OSQP workspace for QPs of one size: dense P (upper triangle), constant A.
+
+    Parameters
+    ----------
+    A : scipy.sparse.csc_matrix, shape (m, n)
+    tolerance : float
+        Absolute and relative.
+    max_iterations : int
+    """
+
+    def __init__(self, A: sp.csc_matrix, tolerance: float = 1e-5, max_iterations: int = 4000) -> None:
+        m, n = A.shape
+        self.n, self.m = n, m
+        self._n_hessian = n * (n + 1) // 2
+        # An explicit pattern: zeros of the start must not drop out of it.
+        rows = np.concatenate([np.arange(j + 1) for j in range(n)])
+        starts = np.arange(n + 1) * (np.arange(n + 1) + 1) // 2
+        diagonal = (rows == np.repeat(np.arange(n), np.arange(1, n + 1))).astype(float)
+        hessian = sp.csc_matrix((diagonal, rows, starts), shape=(n, n))
+        self._upper = np.triu_indices(n)
+        self._full = np.zeros((n, n))
+        self._a = sp.csr_matrix(A)
+        self._dense_a = np.ascontiguousarray(A.toarray())
+        self._osqp = osqp.OSQP()
+        self._osqp.setup(
+            hessian, np.zeros(n), A, -np.ones(m), np.ones(m), verbose=False, eps_abs=tolerance, eps_rel=tolerance,
+            max_iter=max_iterations, adaptive_rho=1, rho=_RHO, scaling=2, check_termination=5, polishing=False,
+        )  # fmt: skip
+        self._columns = np.repeat(np.arange(n), np.arange(1, n + 1))
+        self._rows = rows
+
+    def reset(self) -> None:
+        """Forget the last solution and the adapted step size, for a reproducible start."""
+        self._require(self._osqp.warm_start(np.zeros(self.n), np.zeros(self.m)), "warm_start")
+        self._osqp.update_settings(rho=_RHO)
+
+    def warm_start(self, x: np.ndarray) -> None:
+        """Start the next solve from x, shape (n,), keeping the last multipliers."""
+        self._require(self._osqp.warm_start(self._checked("x", x, self.n), None), "warm_start")
+
+    def update(self, P: np.ndarray, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> None:  # noqa: E741
+        """Replace the data.
+
+        Parameters
+        ----------
+        P : ndarray, shape (n (n + 1) / 2,)
+            Upper triangle, column by column.
+        q : ndarray, shape (n,)
+        l, u : ndarray, shape (m,)
+            Bounds; infinite entries are allowed.
+
+        Raises
+        ------
+        ValueError
+            Wrong shape or type, an entry that is not finite, or l > u; the old data then stay.
+        InfeasibleError
+            Some bounds cross; ``limit`` is the row.
+        """
+        P, q = self._checked("P", P, self._n_hessian), self._checked("q", q, self.n)
+        l, u = self._checked("l", l, self.m, bound=True), self._checked("u", u, self.m, bound=True)  # noqa: E741
+        gap = u - l
+        if not gap.min() >= 0:
+            row = int(np.argmin(gap))
+            raise InfeasibleError(
+                f"bounds of row {row} cross: lower {l[row]:.6g} > upper {u[row]:.6g}; relax one of them",
+                status="crossed bounds",
+                limit=row,
+            )
+        core = self._osqp._solver
+        self._require(core.update_data_mat(P_x=P, P_i=None, A_x=None, A_i=None), "update_data_mat")
+        self._require(core.update_data_vec(q=q, l=l, u=u), "update_data_vec")
+        self._data = P, q, l, u
+
+    def solve(self) -> Solution:
+        """Solve the current data.
+
+        Raises
+        ------
+        InfeasibleError
+            OSQP's status is anything but "solved"; ``status`` says what, ``iterations`` how far it got.
+        """
+        core = self._osqp._solver
+        core.solve()
+        info = core.info
+        if info.status_val != osqp.SolverStatus.OSQP_SOLVED:
+            status, iterations = info.status, int(info.iter)
+            self.reset()  # an unsolved problem's iterate must not start the next one
+            raise InfeasibleError(
+                f"the QP was not solved: {status} after {iterations} iterations; "
+                "relax the limits, shorten the horizon or raise max_iterations",
+                status=status,
+                iterations=iterations,
+                limit=None,
+            )
+        x, y = np.array(core.solution.x), np.array(core.solution.y)
+        primal, dual = self._residuals(x, y)
+        return Solution(x, y, int(info.iter), primal, dual)
+
+    def _residuals(self, x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+        hessian, q, lower, upper = self._data
+        full = self._full
+        full[self._rows, self._columns] = hessian
+        full[self._columns, self._rows] = hessian
+        ax = self._dense_a @ x
+        primal = max(float((lower - ax).max()), float((ax - upper).max()), 0.0)
+        dual = float(np.abs(full @ x + q + y @ self._dense_a).max())
+        return primal, dual
+
+    @staticmethod
+    def _checked(name: str, value: np.ndarray, size: int, bound: bool = False) -> np.ndarray:
+        array = np.ascontiguousarray(value, dtype=float)
+        if array.shape != (size,):
+            raise ValueError(f"{name} has shape {array.shape}, expected ({size},)")
+        if np.isnan(array).any() if bound else not np.isfinite(array).all():
+            raise ValueError(f"{name} is not finite")
+        # OSQP's infinity is 1e30: larger bounds are refused by it.
+        return np.clip(array, -1e30, 1e30) if bound else array
+
+    @staticmethod
+    def _require(code: int | None, call: str) -> None:
+        if code:
+            raise RuntimeError(f"OSQP refused {call} with code {code}; the old data are still in place")

@@ -1,0 +1,205 @@
+"""The MPC problem as a QP in the inputs alone: min 1/2 U'PU + q'U subject to l <= A U <= u."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+
+from ..buffered import BufferedFunction
+from ..linearisation.model import LinearModel
+from .tuning import Limits, Tuning
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What to track over the horizon.
+
+    Attributes
+    ----------
+    states : ndarray, shape (N, 4 + n)
+        Wanted [p, v, q] at the end of each period.
+    inputs : ndarray, shape (N, n)
+        Feed-forward motor rates in each period [rad/s].
+    """
+
+    states: np.ndarray
+    inputs: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticProgram:
+    """QP data; U = [u_0, .., u_{N-1}].
+
+    Attributes
+    ----------
+    P : ndarray, shape (Nn (Nn + 1) / 2,)
+        Upper triangle of the Hessian, column by column.
+    q : ndarray, shape (Nn,)
+    A : scipy.sparse.csc_matrix, shape (3 N n, N n)
+        Rows: rates, changes of rate, angles. The motors integrate their rates, so A never changes.
+    l, u : ndarray, shape (3 N n,)
+        Bounds.
+    """
+
+    P: np.ndarray
+    q: np.ndarray
+    A: sp.csc_matrix
+    l: np.ndarray  # noqa: E741  OSQP's name
+    u: np.ndarray
+
+
+def build_qp(
+    x: np.ndarray,
+    models: LinearModel | Sequence[LinearModel],
+    reference: Reference,
+    u_previous: np.ndarray,
+    tuning: Tuning,
+    limits: Limits,
+    terminal_weight: np.ndarray,
+) -> QuadraticProgram:
+    """Assemble the QP of one control step.
+
+    Minimises 1/2 sum_k |x_k - xr_k|^2_Q + 1/2 |x_N - xr_N|^2_T + 1/2 sum_k |u_k - ur_k|^2_R over the affine
+    model, with the states eliminated.
+
+    Parameters
+    ----------
+    x : ndarray, shape (4 + n,)
+        Current state.
+    models : LinearModel or sequence of N
+        One model for the whole horizon, or one for each period.
+    reference : Reference
+    u_previous : ndarray, shape (n,)
+        Input of the last period, from which the change of rate counts [rad/s].
+    terminal_weight : ndarray, shape (4 + n, 4 + n)
+        T, for instance the cost-to-go of the LQR.
+    """
+    single = isinstance(models, LinearModel)
+    sequence: Sequence[LinearModel] = [models] if isinstance(models, LinearModel) else models
+    n_states, n = sequence[0].B.shape
+    if not single and len(sequence) != tuning.horizon:
+        raise ValueError(f"models has {len(sequence)} entries, expected 1 or the horizon {tuning.horizon}")
+    _check_shapes(x, reference, u_previous, tuning.horizon, n_states, n)
+    function = _condensing(tuning.horizon, n, single, threading.get_ident())
+    a, b, c, start, states, inputs, previous, weights, terminal, bounds, dt = function.inputs
+    for k, model in enumerate(sequence):
+        a[:, k * n_states : (k + 1) * n_states] = model.A
+        b[:, k * n : (k + 1) * n] = model.B
+        c[k * n_states : (k + 1) * n_states] = model.c
+    start[:] = x
+    states[:] = reference.states.T
+    inputs[:] = reference.inputs.T
+    previous[:] = u_previous
+    weights[:] = tuning.position_weight, tuning.velocity_weight, tuning.angle_weight, tuning.input_weight
+    terminal[:] = terminal_weight
+    bounds[:, 0] = limits.rate
+    bounds[:, 1] = limits.rate_change
+    bounds[:, 2] = limits.angle_lower
+    bounds[:, 3] = limits.angle_upper
+    dt[0] = sequence[0].dt
+    function()
+    p, q, lower, upper = function.outputs
+    return QuadraticProgram(p.copy(), q.copy(), constraint_matrix(tuning.horizon, n, sequence[0].dt),
+                            lower.copy(), upper.copy())  # fmt: skip
+
+
+@lru_cache(maxsize=16)
+def constraint_matrix(horizon: int, n: int, dt: float) -> sp.csc_matrix:
+    """Rows of the rates, of their changes, and of the angles they integrate to, shape (3 N n, N n)."""
+    each = sp.identity(n)
+    rates = sp.identity(horizon * n)
+    changes = sp.kron(sp.diags([1.0, -1.0], [0, -1], shape=(horizon, horizon)), each)
+    angles = sp.kron(dt * np.tril(np.ones((horizon, horizon))), each)
+    matrix = sp.vstack([rates, changes, angles]).tocsc()
+    matrix.sort_indices()
+    return matrix
+
+
+def _check_shapes(
+    x: np.ndarray, reference: Reference, u_previous: np.ndarray, horizon: int, n_states: int, n: int
+) -> None:
+    expected = {"x": (n_states,), "u_previous": (n,), "reference.states": (horizon, n_states),
+                "reference.inputs": (horizon, n)}  # fmt: skip
+    found = {"x": x, "u_previous": u_previous, "reference.states": reference.states,
+             "reference.inputs": reference.inputs}  # fmt: skip
+    for name, shape in expected.items():
+        if found[name].shape != shape:
+            raise ValueError(f"{name} has shape {found[name].shape}, expected {shape}")
+
+
+@lru_cache(maxsize=32)
+def _condensing(horizon: int, n: int, single: bool, thread: int) -> BufferedFunction:
+    """Linear models, state and reference to (P, q, l, u) in one graph."""
+    n_states = 4 + n
+    count = 1 if single else horizon
+    a_all, b_all, c_all = (
+        ca.SX.sym(name, *shape)
+        for name, shape in (("A", (n_states, count * n_states)), ("B", (n_states, count * n)), ("c", (count * n_states, 1)))
+    )
+    x = ca.SX.sym("x", n_states)
+    states, inputs = ca.SX.sym("states", n_states, horizon), ca.SX.sym("inputs", n, horizon)
+    previous, weights = ca.SX.sym("previous", n), ca.SX.sym("weights", 4)
+    terminal, bounds, dt = ca.SX.sym("terminal", n_states, n_states), ca.SX.sym("bounds", n, 4), ca.SX.sym("dt")
+
+    def part(block: Any, k: int, width: int) -> Any:
+        k = 0 if single else k
+        return block[:, k * width : (k + 1) * width]
+
+    a, b, c = [], [], []
+    for k in range(horizon):
+        # The motors are exact integrators: writing their rows as constants prunes the graph.
+        mine = part(a_all, k, n_states)
+        a.append(ca.vertcat(mine[:4, :], ca.horzcat(ca.SX(n, 4), ca.SX.eye(n))))
+        b.append(ca.vertcat(part(b_all, k, n)[:4, :], dt * ca.SX.eye(n)))
+        c.append(ca.vertcat(c_all[(0 if single else k) * n_states :][:4], ca.SX(n, 1)))
+    stage = ca.diag(ca.vertcat(ca.repmat(weights[0], 2), ca.repmat(weights[1], 2), ca.repmat(weights[2], n)))
+
+    # Free response and, backwards, its gradient (adjoint) and the cost-to-go of a disturbance (S).
+    free = [x]
+    for k in range(horizon):
+        free.append(a[k] @ free[k] + b[k] @ inputs[:, k] + c[k])
+    cost_to_go, adjoint = [terminal], [terminal @ (free[-1] - states[:, -1])]
+    for k in range(horizon - 1, 0, -1):
+        cost_to_go.insert(0, stage + a[k].T @ cost_to_go[0] @ a[k])
+        adjoint.insert(0, stage @ (free[k] - states[:, k - 1]) + a[k].T @ adjoint[0])
+
+    responses: dict[tuple[int, int], Any] = {}
+
+    def response(k: int, i: int) -> Any:
+        """dx_k / du_i; with one model it depends on k - i alone."""
+        key = (k - i, 0) if single else (k, i)
+        if key not in responses:
+            responses[key] = b[i] if k == i + 1 else a[k - 1] @ response(k - 1, i)
+        return responses[key]
+
+    blocks = [[ca.SX(n, n) for _ in range(horizon)] for _ in range(horizon)]
+    for j in range(horizon):
+        weighted = cost_to_go[j] @ b[j]
+        for i in range(j + 1):
+            blocks[i][j] = response(j + 1, i).T @ weighted
+        blocks[j][j] += weights[3] * ca.SX.eye(n)
+    hessian = ca.vertcat(*(ca.horzcat(*row) for row in blocks))
+    upper_triangle = ca.vertcat(*(hessian[: j + 1, j] for j in range(horizon * n)))
+    # The free response was taken at U = feed-forward, so the gradient at U = 0 is moved back by P U.
+    feed_forward = ca.vec(inputs)
+    full = ca.triu(hessian) + ca.triu(hessian, False).T
+    gradient = ca.vertcat(*(b[k].T @ adjoint[k] for k in range(horizon))) - full @ feed_forward
+
+    rate, change, lower, upper = (bounds[:, i] for i in range(4))
+    first = ca.vertcat(previous, ca.SX(n * (horizon - 1), 1))
+    l_all = [-ca.repmat(rate, horizon, 1), first - ca.repmat(change, horizon, 1), ca.repmat(lower - x[4:], horizon, 1)]
+    u_all = [ca.repmat(rate, horizon, 1), first + ca.repmat(change, horizon, 1), ca.repmat(upper - x[4:], horizon, 1)]
+    function = ca.Function(
+        "condense",
+        [a_all, b_all, c_all, x, states, inputs, previous, weights, terminal, bounds, dt],
+        [upper_triangle, gradient, ca.vertcat(*l_all), ca.vertcat(*u_all)],
+        {"cse": True},
+    )
+    return BufferedFunction(function)

@@ -1,0 +1,106 @@
+"""What a controller is told: its weights, its solver's settings, and the limits it must keep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..toml_table import read_toml
+
+FALLBACKS = ("shifted_plan", "raise")
+
+
+@dataclass(frozen=True)
+class Model:
+    """Discretisation of the model that the controller linearises (see `solve_statics`)."""
+
+    method: str = "multiple_shooting"
+    segments: int = 8
+    steps: int = 4
+    scheme: str = "rk4"
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Tuning of the linear MPC.
+
+    Attributes
+    ----------
+    name : str
+    horizon : int
+        Control periods predicted.
+    position_weight, velocity_weight, angle_weight : float
+        On deviations from the reference, at every period [1/m^2], [1/(m/s)^2], [1/rad^2].
+    input_weight : float
+        On deviations of the motor rates from the feed-forward [1/(rad/s)^2].
+    tolerance : float
+        OSQP's absolute and relative tolerance.
+    max_iterations : int
+        After which OSQP gives up.
+    fallback : {"shifted_plan", "raise"}
+        What an unsolved QP leads to: the next input of the last plan, or an error.
+    model : Model
+        What is linearised.
+    """
+
+    name: str
+    horizon: int
+    position_weight: float
+    velocity_weight: float
+    angle_weight: float
+    input_weight: float
+    tolerance: float
+    max_iterations: int
+    fallback: str
+    model: Model
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Hard limits on the motors.
+
+    Attributes
+    ----------
+    rate : float
+        Greatest |u| [rad/s].
+    rate_change : float
+        Greatest |u_k - u_{k-1}| between control periods [rad/s].
+    angle_lower, angle_upper : ndarray, shape (n,)
+        Least and greatest motor angles [rad].
+    """
+
+    rate: float
+    rate_change: float
+    angle_lower: np.ndarray
+    angle_upper: np.ndarray
+
+
+def load_tuning(path: str | Path) -> Tuning:
+    """Read a controller tuning from TOML (see ``controllers/default.toml``).
+
+    Raises
+    ------
+    ModelError
+        A key is missing, misspelt, of the wrong type or out of range.
+    """
+    with read_toml(path) as file:
+        with file.table("weights") as weights, file.table("solver", {}) as solver, file.table("model", {}) as model:
+            return Tuning(
+                name=file.text("name"),
+                horizon=file.integer("horizon"),
+                position_weight=weights.number("position", above=0.0),
+                velocity_weight=weights.number("velocity", 0.0, minimum=0.0),
+                angle_weight=weights.number("angle", 0.0, minimum=0.0),
+                input_weight=weights.number("input", above=0.0),
+                tolerance=solver.number("tolerance", 1e-5, above=0.0),
+                max_iterations=solver.integer("max_iterations", 4000),
+                fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),
+                model=Model(
+                    method=model.text("method", Model.method),
+                    segments=model.integer("segments", Model.segments),
+                    steps=model.integer("steps", Model.steps),
+                    scheme=model.text("scheme", Model.scheme),
+                ),
+            )

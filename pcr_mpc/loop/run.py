@@ -1,0 +1,156 @@
+"""The record of a closed-loop run."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .scene import Scene
+
+# Commands within this of a limit keep it (rounding).
+_LIMIT_SLACK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Everything that happened, at the plant's steps (K + 1 times) and at control periods (M).
+
+    Attributes
+    ----------
+    scene : Scene
+    controller, plant : str
+        What ran.
+    seed : int
+        Of the measurement noise.
+    t : ndarray, shape (K + 1,)
+        [s].
+    x : ndarray, shape (K + 1, 4 + n)
+        States of the plant.
+    reference : ndarray, shape (K + 1, 2)
+        Wanted tip positions [m]; NaN if there is nothing to track.
+    u : ndarray, shape (M, n)
+        Commanded motor rates [rad/s].
+    plant_time : ndarray, shape (K,)
+        Wall time of each plant step [s].
+    control_time : ndarray, shape (M, 4)
+        Wall time of each control step: total, linearisation, QP update, QP solution [s].
+    iterations : ndarray, shape (M,)
+        Of OSQP.
+    events : list of dict
+        Fall-backs and failures: time, kind, message.
+    """
+
+    scene: Scene
+    controller: str
+    plant: str
+    seed: int
+    t: np.ndarray
+    x: np.ndarray
+    reference: np.ndarray
+    u: np.ndarray
+    plant_time: np.ndarray
+    control_time: np.ndarray
+    iterations: np.ndarray
+    events: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def error(self) -> np.ndarray:
+        """Distance of the tip from the reference, shape (K + 1,) [m]."""
+        return np.asarray(np.hypot(*(self.x[:, :2] - self.reference).T))
+
+    def limit_violations(self) -> int:
+        """Control periods in which a command broke the limit on rate, on its change, or on the angle."""
+        robot, period = self.scene.robot, self.scene.period
+        change = np.diff(self.u, axis=0, prepend=np.zeros((1, robot.n_rods)))
+        per = self.scene.steps_per_period
+        angles = self.x[per::per, 4:][: len(self.u)]
+        lower, upper = robot.angle_limits.T
+        broken = np.abs(self.u).max(axis=1, initial=0.0) > robot.rate_limit + _LIMIT_SLACK
+        broken |= np.abs(change).max(axis=1, initial=0.0) > robot.acceleration_limit * period + _LIMIT_SLACK
+        outside = ((angles < lower - _LIMIT_SLACK) | (angles > upper + _LIMIT_SLACK)).any(axis=1)
+        broken[: len(outside)] |= outside
+        return int(broken.sum())
+
+    def hash(self) -> str:
+        """Digest of states and inputs: equal for runs that are equal bit for bit."""
+        digest = hashlib.sha256()
+        for array in (self.t, self.x, self.u):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()[:16]
+
+    def summary(self) -> dict[str, Any]:
+        """Figures of the run, ready for JSON; what does not apply is None."""
+        tracked = bool(np.isfinite(self.reference).all()) and len(self.t) > 0
+        error_mm = 1e3 * self.error
+        late = error_mm[self.t >= 1.0]
+        kinds = [event["kind"] for event in self.events]
+        return {
+            "scene": self.scene.name,
+            "controller": self.controller,
+            "plant": self.plant,
+            "seed": self.seed,
+            "duration_s": float(self.t[-1]),
+            "rms_mm": _rms(error_mm) if tracked else None,
+            "rms_after_1s_mm": _rms(late) if tracked and len(late) else None,
+            "max_mm": float(error_mm.max()) if tracked else None,
+            "final_error_mm": float(error_mm[-1]) if tracked else None,
+            "final_tip_m": self.x[-1, :2].tolist(),
+            "plant_step_us": percentiles(1e6 * self.plant_time),
+            "control_step_us": percentiles(1e6 * self.control_time[:, 0]),
+            "control_parts_us": {
+                name: percentiles(1e6 * self.control_time[:, 1 + i])
+                for i, name in enumerate(("linearise", "update", "solve"))
+            },
+            "plant_budget_us": 1e6 * self.scene.plant.dt,
+            "control_budget_us": 1e6 * self.scene.period,
+            "qp_iterations": {
+                "p50": int(np.median(self.iterations)) if len(self.iterations) else None,
+                "max": int(self.iterations.max(initial=0)),
+            },
+            "limit_violations": self.limit_violations(),
+            "fallbacks": kinds.count("fallback"),
+            "failures": kinds.count("failure"),
+            "events": self.events,
+            "run_hash": self.hash(),
+        }
+
+    def save(self, folder: str | Path) -> dict[str, str]:
+        """Write run.npz, run.csv and summary.json; return their paths by name."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        files = {name: str(folder / name) for name in ("run.npz", "run.csv", "summary.json")}
+        np.savez_compressed(
+            files["run.npz"], t=self.t, x=self.x, u=self.u, reference=self.reference, plant_time=self.plant_time,
+            control_time=self.control_time, iterations=self.iterations,
+        )  # fmt: skip
+        n = self.scene.robot.n_rods
+        per = self.scene.steps_per_period
+        with open(files["run.csv"], "w", newline="", encoding="utf-8") as handle:
+            writer = csv.writer(handle)
+            writer.writerow(["t_s", "p_x_m", "p_y_m", "v_x_m_s", "v_y_m_s", *(f"q{i}_rad" for i in range(n)),
+                             "ref_x_m", "ref_y_m", *(f"u{i}_rad_s" for i in range(n))])  # fmt: skip
+            for k, (t, x, reference) in enumerate(zip(self.t, self.x, self.reference, strict=True)):
+                period = min(k // per, len(self.u) - 1)
+                rates = self.u[period] if len(self.u) else np.full(n, math.nan)
+                writer.writerow(f"{value:.9g}" for value in (t, *x, *reference, *rates))
+        Path(files["summary.json"]).write_text(json.dumps({**self.summary(), "files": files}, indent=2) + "\n")
+        return files
+
+
+def percentiles(values: np.ndarray) -> dict[str, float | None]:
+    """p50, p95, p99 and maximum; None where there is nothing to count."""
+    if not len(values):
+        return dict.fromkeys(("p50", "p95", "p99", "max"))
+    p50, p95, p99 = np.percentile(values, [50, 95, 99])
+    return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(values.max())}
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,180 @@
+"""A scene: which robot does what, for how long, simulated how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import ModelError
+from ..plant.dynamics import INTEGRATORS, Plant
+from ..plant.equilibrium import Equilibrium
+from ..plant.free_tip import forward_statics, inverse_statics
+from ..plant.robot import Robot, load_robot
+from ..plant.rod import SCHEMES
+from ..plant.statics import METHODS
+from ..toml_table import Table, read_toml
+from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
+
+
+@dataclass(frozen=True)
+class PlantSettings:
+    """How the plant is simulated: the arguments of `Plant`."""
+
+    method: str
+    segments: int
+    steps: int
+    scheme: str
+    integrator: str
+    dt: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One experiment.
+
+    Attributes
+    ----------
+    name : str
+    robot : Robot
+        With the scene's own limits, if it has some.
+    duration : float
+        [s].
+    start_tip : (float, float) or None
+        Tip position at the start [m]; the motors are found by inverse statics in working mode ``start_mode``.
+    start_motors : tuple of float or None
+        Motor angles at the start [rad]; the tip is found by forward statics. One of the two is given.
+    start_mode : str or None
+    start_velocity : (float, float)
+        Tip velocity at the start [m/s].
+    trajectory : Trajectory or None
+        What to track. None: the motors stay where they are.
+    plant : PlantSettings
+    period : float
+        Control period [s], a multiple of the plant's step.
+    force : (float, float)
+        External force on the tip, unknown to the controller [N].
+    tip_noise : float
+        Standard deviation of the measured tip position [m].
+    """
+
+    name: str
+    robot: Robot
+    duration: float
+    start_tip: tuple[float, float] | None
+    start_motors: tuple[float, ...] | None
+    start_mode: str | None
+    start_velocity: tuple[float, float]
+    trajectory: Trajectory | None
+    plant: PlantSettings
+    period: float
+    force: tuple[float, float]
+    tip_noise: float
+
+    @property
+    def steps_per_period(self) -> int:
+        """Plant steps in a control period."""
+        return round(self.period / self.plant.dt)
+
+    @property
+    def n_periods(self) -> int:
+        """Control periods in the run."""
+        return round(self.duration / self.period)
+
+    def start(self) -> Equilibrium:
+        """Solve for the pose in which the robot starts, in balance without load."""
+        if self.start_motors is not None:
+            return forward_statics(self.robot, self.start_motors)
+        return inverse_statics(self.robot, self.start_tip, mode=self.start_mode)
+
+    def make_plant(self) -> Plant:
+        """Build the plant of this scene."""
+        settings = self.plant
+        return Plant(
+            self.robot,
+            method=settings.method,
+            segments=settings.segments,
+            steps=settings.steps,
+            scheme=settings.scheme,
+            integrator=settings.integrator,
+            dt=settings.dt,
+        )
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Read a scene from TOML (see ``models/scenes/lemniscate.toml``); its robot's path is relative to it.
+
+    Raises
+    ------
+    ModelError
+        A key is missing, misspelt, of the wrong type or out of range, in the scene or in its robot.
+    """
+    with read_toml(path) as file:
+        name = file.text("name")
+        robot = load_robot(file.path.parent / file.text("robot"))
+        duration = file.number("duration", above=0.0)
+        with file.table("limits", {}) as limits:
+            robot = replace(
+                robot,
+                rate_limit=limits.number("rate", robot.rate_limit, above=0.0),
+                acceleration_limit=limits.number("acceleration", robot.acceleration_limit, above=0.0),
+            )
+        with file.table("start") as start:
+            tip = start.vector("tip", 2, None)
+            motors = start.vector("motors", robot.n_rods, None)
+            mode = start.text("mode", None)
+            velocity = start.vector("velocity", 2, (0.0, 0.0))
+            if (tip is None) == (motors is None) or (tip is not None and mode is None):
+                raise start.fail("tip", "give either tip and mode, or motors")
+        with file.table("plant") as table:
+            plant = PlantSettings(
+                method=table.text("method", "multiple_shooting", choices=METHODS),
+                segments=table.integer("segments", 8),
+                steps=table.integer("steps", 4),
+                scheme=table.text("scheme", "rk4", choices=tuple(SCHEMES)),
+                integrator=table.text("integrator", choices=tuple(INTEGRATORS)),
+                dt=table.number("dt", above=0.0),
+            )
+        with file.table("control") as control:
+            period = control.number("period", above=0.0)
+            ratio = period / plant.dt
+            if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio:
+                raise control.fail("period", f"is {period} s, not a multiple of the plant's step {plant.dt} s")
+        with file.table("load", {}) as load, file.table("sensor", {}) as sensor:
+            force = load.vector("force", 2, (0.0, 0.0))
+            noise = sensor.number("tip_noise", 0.0, minimum=0.0)
+        with file.table("reference") as reference:
+            trajectory = _trajectory(reference)
+    scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period, force, noise)
+    if tip is not None and trajectory is not None:
+        begin = trajectory(np.zeros(1))[0, 0]
+        if np.hypot(*(begin - tip)) > 1e-9:
+            raise ModelError(
+                f"{path}: start.tip {tip} is not where the reference begins, {tuple(begin.tolist())}",
+                file=str(path),
+                key="start.tip",
+            )
+    return scene
+
+
+def _trajectory(table: Table) -> Trajectory | None:
+    kind = table.text("kind", choices=("none", "hold", "lemniscate", "pick_and_place"))
+    if kind == "hold":
+        return Hold(table.vector("position", 2))
+    if kind == "lemniscate":
+        return Lemniscate(
+            centre=table.vector("centre", 2),
+            size=table.vector("size", 2),
+            period=table.number("period", above=0.0),
+            ramp=table.number("ramp", above=0.0),
+        )
+    if kind == "pick_and_place":
+        return PickAndPlace(
+            pick=table.vector("pick", 2),
+            place=table.vector("place", 2),
+            lift=table.number("lift"),
+            wait=table.number("wait", minimum=0.0),
+            move=table.number("move", above=0.0),
+        )
+    return None

@@ -1,0 +1,111 @@
+"""The closed loop: a controller drives the nonlinear plant."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ..errors import PCRError, SimulationError
+from ..plant.dynamics import Plant
+from .controllers import Controller
+from .run import Run
+from .scene import Scene
+
+
+def simulate(
+    scene: Scene, plant: Plant, controller: Controller, seed: int = 0, *, progress: bool = False
+) -> Run:
+    """Run a scene in closed loop.
+
+    Parameters
+    ----------
+    scene : Scene
+    plant : Plant
+        What really moves; its step must divide the scene's control period.
+    controller : Controller
+        Sees the measured state only, and predicts with a model of its own.
+    seed : int
+        Of the measurement noise.
+    progress : bool
+        Show a progress bar on stderr.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    SimulationError
+        The plant or the controller failed, or the run was interrupted; its ``run`` holds everything until
+        then, and its ``__cause__`` is the failure.
+    """
+    per = round(scene.period / plant.dt)
+    if per < 1 or abs(per * plant.dt - scene.period) > 1e-9 * scene.period:
+        raise ValueError(f"plant.dt = {plant.dt} s does not divide the control period {scene.period} s")
+    pose = scene.start()
+    x = np.concatenate([pose.p, scene.start_velocity, pose.q])
+    plant.reset(x, pose)
+    controller.start(pose)
+    noise = np.random.default_rng(seed)
+    n_periods, n = scene.n_periods, scene.robot.n_rods
+
+    states = np.empty((n_periods * per + 1, len(x)))
+    inputs = np.empty((n_periods, n))
+    plant_time = np.empty(n_periods * per)
+    control_time = np.zeros((n_periods, 4))
+    iterations = np.zeros(n_periods, dtype=int)
+    events: list[dict[str, Any]] = []
+    states[0] = x
+    done, decided = 0, 0
+
+    def record() -> Run:
+        t = plant.dt * np.arange(done + 1)
+        reference = np.full((done + 1, 2), np.nan) if scene.trajectory is None else scene.trajectory(t)[:, 0]
+        return Run(
+            scene=scene,
+            controller=controller.name,
+            plant=f"{plant.method}, {plant.integrator}, dt = {1e3 * plant.dt:g} ms",
+            seed=seed,
+            t=t,
+            x=states[: done + 1].copy(),
+            reference=reference,
+            u=inputs[:decided].copy(),
+            plant_time=plant_time[:done].copy(),
+            control_time=control_time[:decided].copy(),
+            iterations=iterations[:decided].copy(),
+            events=events,
+        )
+
+    try:
+        for k in tqdm(range(n_periods), desc=scene.name, unit="period", disable=not progress):
+            measured = x.copy()
+            if scene.tip_noise:
+                measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
+            began = time.perf_counter()
+            decision = controller.step(k, measured)
+            control_time[k, 0] = time.perf_counter() - began
+            inputs[k] = decision.u
+            decided = k + 1
+            if decision.plan is not None:
+                plan = decision.plan
+                control_time[k, 1:] = decision.linearise_time, plan.update_time, plan.solve_time
+                iterations[k] = plan.iterations
+                if plan.fallback:
+                    events.append({"t": k * scene.period, "kind": "fallback", "message": f"{plan.status}: {plan.fallback}"})
+            for _ in range(per):
+                began = time.perf_counter()
+                x = plant.step(x, decision.u, scene.force)
+                plant_time[done] = time.perf_counter() - began
+                done += 1
+                states[done] = x
+    except (PCRError, KeyboardInterrupt) as error:
+        what = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
+        t = done * plant.dt
+        events.append({"t": t, "kind": "failure", "message": what})
+        raise SimulationError(
+            f"{scene.name} stopped at t = {t:.4f} s of {scene.duration} s: {what}", run=record(), t=t
+        ) from error
+    return record()
