@@ -87,7 +87,9 @@ def build_qp(
     if not single and len(sequence) != tuning.horizon:
         raise ValueError(f"models has {len(sequence)} entries, expected 1 or the horizon {tuning.horizon}")
     _check_shapes(x, reference, u_previous, tuning.horizon, n_states, n)
-    function = _condensing(tuning.horizon, n, single, threading.get_ident())
+    function = _condensing(
+        tuning.horizon, n, single, tuning.velocity_weight > 0, tuning.angle_weight > 0, threading.get_ident()
+    )
     a, b, c, start, states, inputs, previous, weights, terminal, bounds, dt = function.inputs
     for k, model in enumerate(sequence):
         a[:, k * n_states : (k + 1) * n_states] = model.A
@@ -135,7 +137,7 @@ def _check_shapes(
 
 
 @lru_cache(maxsize=32)
-def _condensing(horizon: int, n: int, single: bool, thread: int) -> BufferedFunction:
+def _condensing(horizon: int, n: int, single: bool, velocity: bool, angle: bool, thread: int) -> BufferedFunction:
     """Linear models, state and reference to (P, q, l, u) in one graph."""
     n_states = 4 + n
     count = 1 if single else horizon
@@ -159,16 +161,18 @@ def _condensing(horizon: int, n: int, single: bool, thread: int) -> BufferedFunc
         a.append(ca.vertcat(mine[:4, :], ca.horzcat(ca.SX(n, 4), ca.SX.eye(n))))
         b.append(ca.vertcat(part(b_all, k, n)[:4, :], dt * ca.SX.eye(n)))
         c.append(ca.vertcat(c_all[(0 if single else k) * n_states :][:4], ca.SX(n, 1)))
-    stage = ca.diag(ca.vertcat(ca.repmat(weights[0], 2), ca.repmat(weights[1], 2), ca.repmat(weights[2], n)))
+    # A weight of zero is left out of the graph, not multiplied.
+    used = [weights[0], weights[1] if velocity else ca.SX(1, 1), weights[2] if angle else ca.SX(1, 1)]
+    stage = ca.diag(ca.vertcat(used[0], used[0], used[1], used[1], *[used[2]] * n))
 
-    # Free response and, backwards, its gradient (adjoint) and the cost-to-go of a disturbance (S).
+    # Free response (no input) and, backwards, the gradient of its cost: the adjoint.
     free = [x]
     for k in range(horizon):
-        free.append(a[k] @ free[k] + b[k] @ inputs[:, k] + c[k])
-    cost_to_go, adjoint = [terminal], [terminal @ (free[-1] - states[:, -1])]
+        free.append(a[k] @ free[k] + c[k])
+    adjoint = [terminal @ (free[-1] - states[:, -1])]
     for k in range(horizon - 1, 0, -1):
-        cost_to_go.insert(0, stage + a[k].T @ cost_to_go[0] @ a[k])
         adjoint.insert(0, stage @ (free[k] - states[:, k - 1]) + a[k].T @ adjoint[0])
+    gradient = ca.vertcat(*(b[k].T @ adjoint[k] - weights[3] * inputs[:, k] for k in range(horizon)))
 
     responses: dict[tuple[int, int], Any] = {}
 
@@ -179,18 +183,22 @@ def _condensing(horizon: int, n: int, single: bool, thread: int) -> BufferedFunc
             responses[key] = b[i] if k == i + 1 else a[k - 1] @ response(k - 1, i)
         return responses[key]
 
+    # Block (i, j) of the Hessian is the sum over k > j of (dx_k/du_i)' Q_k (dx_k/du_j). With one model the terms
+    # before the last period are those of block (i + 1, j + 1) and one more.
     blocks = [[ca.SX(n, n) for _ in range(horizon)] for _ in range(horizon)]
-    for j in range(horizon):
-        weighted = cost_to_go[j] @ b[j]
+    ends: dict[tuple[int, int], Any] = {}
+    for j in range(horizon - 1, -1, -1):
+        last = terminal @ response(horizon, j)
+        weighted = {k: stage @ response(k, j) for k in range(j + 1, horizon)}
         for i in range(j + 1):
-            blocks[i][j] = response(j + 1, i).T @ weighted
-        blocks[j][j] += weights[3] * ca.SX.eye(n)
-    hessian = ca.vertcat(*(ca.horzcat(*row) for row in blocks))
+            if not single:
+                blocks[i][j] = sum((response(k, i).T @ w for k, w in weighted.items()), ca.SX(n, n))
+            elif j < horizon - 1:
+                blocks[i][j] = blocks[i + 1][j + 1] + response(horizon - 1, i).T @ weighted[horizon - 1]
+            ends[i, j] = blocks[i][j] + response(horizon, i).T @ last
+    hessian = ca.vertcat(*(ca.horzcat(*(ends.get((i, j), ca.SX(n, n)) for j in range(horizon))) for i in range(horizon)))
+    hessian += weights[3] * ca.SX.eye(horizon * n)
     upper_triangle = ca.vertcat(*(hessian[: j + 1, j] for j in range(horizon * n)))
-    # The free response was taken at U = feed-forward, so the gradient at U = 0 is moved back by P U.
-    feed_forward = ca.vec(inputs)
-    full = ca.triu(hessian) + ca.triu(hessian, False).T
-    gradient = ca.vertcat(*(b[k].T @ adjoint[k] for k in range(horizon))) - full @ feed_forward
 
     rate, change, lower, upper = (bounds[:, i] for i in range(4))
     first = ca.vertcat(previous, ca.SX(n * (horizon - 1), 1))

@@ -16,7 +16,7 @@ FALLBACKS = ("shifted_plan", "raise")
 class Model:
     """Discretisation of the model that the controller linearises (see `solve_statics`)."""
 
-    method: str = "multiple_shooting"
+    method: str = "closed_form"
     segments: int = 8
     steps: int = 4
     scheme: str = "rk4"

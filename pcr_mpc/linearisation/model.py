@@ -97,28 +97,38 @@ def _discretisation(n: int, thread: int) -> BufferedFunction:
     mass, drag, dt = ca.vertsplit(parameters)
     p, q = x[:2], x[4:]
 
-    # d/dtau [dp, dv dt, q, u dt, 1] with tau = t/dt in [0, 1]: every entry is dimensionless or small, and
-    # the constant column holds the force at the point of linearisation.
+    # In y = [dp, dv dt] and tau = t/dt the motion is dy/dtau = a y + [0, w0 + w1 tau], where the force at the
+    # start gives w0 and the motors' rates w1; every entry is dimensionless. With phi_1 = int exp(a s) ds and
+    # phi_2 = int (1 - s) exp(a s) ds over [0, 1], y(1) = exp(a) y(0) + phi_1 [0, w0] + phi_2 [0, w1].
     scale = dt * dt / mass
-    constant = -scale * (force - ca.mtimes(k, p) - ca.mtimes(g, q))
-    size = 4 + 2 * n + 1
-    generator = ca.SX(size, size)
-    generator[0:2, 2:4] = ca.SX.eye(2)
-    generator[2:4, 0:2] = -scale * k
-    generator[2:4, 2:4] = -(dt * drag / mass) * ca.SX.eye(2)
-    generator[2:4, 4 : 4 + n] = -scale * g
-    generator[2:4, -1] = constant
-    generator[4 : 4 + n, 4 + n : 4 + 2 * n] = ca.SX.eye(n)
+    a = ca.SX(4, 4)
+    a[0:2, 2:4] = ca.SX.eye(2)
+    a[2:4, 0:2] = -scale * k
+    a[2:4, 2:4] = -(dt * drag / mass) * ca.SX.eye(2)
 
-    scaled = generator / 2**_SQUARINGS
-    exponential = ca.SX.eye(size)
-    for order in range(_TAYLOR_ORDER, 0, -1):
-        exponential = ca.SX.eye(size) + ca.mtimes(scaled, exponential) / order
+    # Taylor series over a fraction of the period, then doubled; of phi_1, phi_2 only the force's columns.
+    fraction = 1.0 / 2**_SQUARINGS
+    power = ca.SX.eye(4)
+    exponential, phi_1, phi_2 = power, fraction * power[:, 2:], fraction**2 / 2 * power[:, 2:]
+    for order in range(1, _TAYLOR_ORDER + 1):
+        power = (fraction / order) * ca.mtimes(a, power)
+        exponential += power
+        phi_1 += fraction / (order + 1) * power[:, 2:]
+        phi_2 += fraction**2 / ((order + 1) * (order + 2)) * power[:, 2:]
     for _ in range(_SQUARINGS):
+        phi_2 = ca.mtimes(exponential, phi_2) + fraction * phi_1 + phi_2
+        phi_1 = ca.mtimes(exponential, phi_1) + phi_1
         exponential = ca.mtimes(exponential, exponential)
+        fraction *= 2
 
-    units = ca.vertcat(1, 1, 1 / dt, 1 / dt, ca.SX.ones(n))
-    rows = ca.diag(units) @ exponential[: 4 + n, :]
-    a = rows[:, : 4 + n] @ ca.diag(1 / units)
-    b = rows[:, 4 + n : 4 + 2 * n] * dt
-    return BufferedFunction(ca.Function("discretise", [k, g, force, x, parameters], [a, b, rows[:, -1]], {"cse": True}))
+    units = ca.vertcat(1, 1, 1 / dt, 1 / dt)
+    by_angle = -scale * ca.mtimes(phi_1, g)
+    by_rate = -scale * dt * ca.mtimes(phi_2, g)
+    top = ca.horzcat(exponential @ ca.diag(1 / units), by_angle)
+    a_matrix = ca.vertcat(ca.diag(units) @ top, ca.horzcat(ca.SX(n, 4), ca.SX.eye(n)))
+    b_matrix = ca.vertcat(ca.diag(units) @ by_rate, dt * ca.SX.eye(n))
+    # About x: y = x - x0, so that the constant is what is left after A x0.
+    state = ca.vertcat(0, 0, dt * x[2], dt * x[3])
+    moved = exponential @ state - scale * ca.mtimes(phi_1, force)
+    c_vector = ca.vertcat(p + moved[:2], moved[2:] / dt, q) - a_matrix @ x
+    return BufferedFunction(ca.Function("discretise", [k, g, force, x, parameters], [a_matrix, b_matrix, c_vector], {"cse": True}))

@@ -129,7 +129,7 @@ def load_scene(path: str | Path) -> Scene:
                 raise start.fail("tip", "give either tip and mode, or motors")
         with file.table("plant") as table:
             plant = PlantSettings(
-                method=table.text("method", "multiple_shooting", choices=METHODS),
+                method=table.text("method", "closed_form", choices=METHODS),
                 segments=table.integer("segments", 8),
                 steps=table.integer("steps", 4),
                 scheme=table.text("scheme", "rk4", choices=tuple(SCHEMES)),

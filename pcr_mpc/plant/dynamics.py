@@ -11,7 +11,7 @@ from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod_solver import TOLERANCE
-from .statics import checked_shooting, make_solver, resampled
+from .statics import checked_shooting, make_solver
 
 # A simulation uses the derivatives only to predict the next pose.
 _PREDICTOR_ACCURACY = 1e-2
@@ -48,7 +48,7 @@ class Plant:
         self,
         robot: Robot,
         *,
-        method: str = "multiple_shooting",
+        method: str = "closed_form",
         segments: int = 8,
         steps: int = 4,
         scheme: str = "rk4",
@@ -63,7 +63,6 @@ class Plant:
         self.method = method
         self.integrator = integrator
         self.dt = dt
-        self._segments = segments
         self.n_states = 4 + robot.n_rods
         self._advance = INTEGRATORS[integrator]
         self._solver = make_solver(robot, method, checked_shooting(segments, steps, scheme))
@@ -78,7 +77,7 @@ class Plant:
         if guess is None:
             self._solver.start(p, q)
         else:
-            self._solver.start(guess.p, guess.q, resampled(guess, self._segments))
+            self._solver.start(guess.p, guess.q, guess.nodes)
             self._solver.move(p, q)
         self._at = (*p.tolist(), *q.tolist())
 
@@ -119,7 +118,7 @@ class Plant:
     def force(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         """F at (p, q), following the branch [N]."""
         self._go(p, q, _PREDICTOR_ACCURACY)
-        return np.array(self._solver.force())
+        return self._solver.force()
 
     def force_and_jacobians(
         self, p: np.ndarray, q: np.ndarray, accuracy: float = TOLERANCE
@@ -130,7 +129,7 @@ class Plant:
         """
         self._at = None  # the last solve may have been content with rougher derivatives
         self._go(p, q, accuracy)
-        return np.array(self._solver.force()), *self._solver.jacobians()
+        return self._solver.force(), *self._solver.jacobians()
 
     def equilibrium(self, x: Any) -> Equilibrium:
         """Everything about the rods at state x, following the branch."""

@@ -13,8 +13,8 @@ from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
 from .chart import held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
-from .rod_solver import RodSolver, Shooting
-from .statics import resampled
+from .rod_method import closed_form_method
+from .rod_solver import RodSolver
 
 _MAX_ITERATIONS = 100
 _FORCE_TOLERANCE = 1e-9  # of the robot's force scale, sum EI/L^2
@@ -53,7 +53,7 @@ def forward_statics(
     q, force = checked_vector("q", q, robot.n_rods), checked_vector("force", force, 2)
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
-        solver.start(guess.p, guess.q, resampled(guess, solver.shooting.segments))
+        solver.start(guess.p, guess.q, guess.nodes)
         n_steps = int(np.ceil(np.abs(q - guess.q).max() / _ANGLE_STEP)) + 1
         p = guess.p
         for t in np.linspace(0.0, 1.0, n_steps + 1)[1:]:
@@ -108,7 +108,7 @@ def inverse_statics(
     robot.require_reachable(p)
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
-        solver.start(guess.p, guess.q, resampled(guess, solver.shooting.segments))
+        solver.start(guess.p, guess.q, guess.nodes)
         return solver.equilibrium(p, _reach(solver, guess, p, force))
     if mode is not None and (len(mode) != robot.n_rods or set(mode) - set("LR")):
         raise ValueError(f"mode is {mode!r}, expected {robot.n_rods} letters L or R")
@@ -141,7 +141,7 @@ def _settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) 
     energy = solver.energy() - force @ p
     radius = 0.1 * robot.lengths.min()
     for iteration in range(_MAX_ITERATIONS):
-        residual = np.array(solver.force()) - force
+        residual = solver.force() - force
         stiffness, _ = solver.jacobians()
         values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
         if np.linalg.norm(residual) <= tolerance:
@@ -165,7 +165,7 @@ def _settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) 
                 solver.move(p + step, q, continuation=False)
                 trial = solver.energy() - force @ (p + step)
                 # Near the minimum the energy is flat to rounding: there the force must shrink instead.
-                if trial < energy or np.linalg.norm(np.array(solver.force()) - force) < 0.5 * np.linalg.norm(residual):
+                if trial < energy or np.linalg.norm(solver.force() - force) < 0.5 * np.linalg.norm(residual):
                     break
             except PCRError:
                 pass
@@ -216,7 +216,7 @@ def _turn(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) ->
     """Turn the motors by Newton's method (least motion if redundant) until the rods carry ``force`` at p."""
     tolerance = _FORCE_TOLERANCE * _force_scale(solver.robot)
     solver.move(p, q)
-    residual = force - np.array(solver.force())
+    residual = force - solver.force()
     for iteration in range(_MAX_ITERATIONS):
         if np.linalg.norm(residual) <= tolerance:
             return q
@@ -225,7 +225,7 @@ def _turn(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) ->
         step *= min(1.0, _ANGLE_STEP / float(np.abs(step).max()))
         while True:
             solver.move(p, q + step)
-            trial = force - np.array(solver.force())
+            trial = force - solver.force()
             if np.linalg.norm(trial) < np.linalg.norm(residual):
                 break
             step = step / 2
@@ -298,4 +298,4 @@ def _force_scale(robot: Robot) -> float:
 
 @lru_cache(maxsize=32)
 def _solver(robot: Robot, thread: int) -> RodSolver:
-    return RodSolver(robot, Shooting())
+    return RodSolver(robot, closed_form_method())

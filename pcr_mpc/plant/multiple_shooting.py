@@ -57,21 +57,25 @@ def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
     Returns
     -------
     newton : casadi.Function
-        (nodes (4N), d (2)) -> step (4N), tangent (4N, 3), base_loads (3, 3), scalars (4): the Newton
-        step; the derivatives of all nodes and of the base's
-        [n_x, n_y, m] with respect to (d_x, d_y, theta_0); and residual norm, energy, number of conjugate points, drift of the invariant m^2/2 + n . t.
-        d is the tip relative to the base; nodes[0] = theta_0 is kept.
+        (nodes (4N), pose (3)) -> step (4N), tangent (4N, 3), loads (3), load_tangent (3, 3), scalars (5).
+        pose = [d_x, d_y, theta_0] is the tip relative to the base and the clamp angle (which replaces
+        nodes[0]); step is the Newton step; tangent and load_tangent are the derivatives of the nodes and of
+        loads = [n_x, n_y, m] at the base with respect to the pose; scalars = [residual norm, length of the
+        step, energy, number of conjugate points, drift of the invariant m^2/2 + n . t], where residual and
+        drift are relative to the size of the load, and the length weighs nodes alike.
     residual : casadi.Function
-        (nodes, d) -> residual norm.
+        (nodes, pose) -> residual norm, loads.
     """
     n, h = segments, 1.0 / segments
-    flat, d = ca.SX.sym("nodes", 4 * n), ca.SX.sym("d", 2)
+    flat, pose = ca.SX.sym("nodes", 4 * n), ca.SX.sym("pose", 3)
     z = [flat[4 * j : 4 * j + 4] for j in range(n)]
+    z[0] = ca.vertcat(pose[2], flat[1:4])
     ends = [propagation(steps, scheme)(node, h) for node in z]
     gaps = [ends[j][2:6] - z[j + 1] for j in range(n - 1)]
-    position = sum(end[:2] for end in ends) - d
+    position = sum(end[:2] for end in ends) - pose[:2]
     moment = ends[-1][5]
-    norm = ca.norm_2(ca.vertcat(*gaps, position, moment))
+    load = 1 + ca.norm_2(z[0][1:3])
+    norm = ca.norm_2(ca.vertcat(*gaps, position, moment)) / load
 
     transition, gap = [], []
     for j, (end, node) in enumerate(zip(ends, z, strict=True)):
@@ -103,10 +107,14 @@ def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
 
     energy = sum(end[6] for end in ends)
     drift = _invariant(ends[-1][2:6]) - _invariant(z[0])
-    results = [moves[:, 0], moves[:, 1:], base_loads[:, 1:], ca.vertcat(norm, energy, conjugate_points, drift)]
+    weights = ca.repmat(ca.vertcat(1, 1 / load, 1 / load, 1 / ca.sqrt(load)), n, 1)
+    scalars = ca.vertcat(
+        norm, ca.norm_2(weights * moves[:, 0]), energy, conjugate_points, drift / (load + z[0][3] ** 2 / 2)
+    )
+    results = [moves[:, 0], moves[:, 1:], z[0][1:], base_loads[:, 1:], scalars]
     options = {"cse": True}
-    newton = ca.Function("rod_newton", [flat, d], [ca.densify(r) for r in results], options)
-    return newton, ca.Function("rod_residual", [flat, d], [norm], options)
+    newton = ca.Function("rod_newton", [flat, pose], [ca.densify(r) for r in results], options)
+    return newton, ca.Function("rod_residual", [flat, pose], [norm, z[0][1:]], options)
 
 
 def _invariant(z: Any) -> Any:

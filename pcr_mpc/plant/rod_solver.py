@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,68 +10,69 @@ from ..buffered import BufferedFunction
 from ..errors import ConvergenceError
 from .chart import held_shapes
 from .equilibrium import Equilibrium
-from .multiple_shooting import rod_newton
 from .robot import Robot
+from .rod_method import RodMethod, warm_step
 
 MAX_ITERATIONS = 60
 # A warm start that needs more is better served by a smaller sub-step.
 _WARM_ITERATIONS = 8
-# Residual at which a rod counts as solved, times 1 + its normalised force.
+# Residual, relative to the load, at which a rod counts as solved.
 TOLERANCE = 1e-10
-# A warm start that turns a node further than this beyond its prediction may have left its branch [rad].
-_BRANCH_ANGLE = 0.3
+# A warm start whose unknowns move further than this beyond the prediction may have left its branch.
+_BRANCH_CHANGE = 0.3
 _SMALLEST_SUBSTEP = 1.0 / 64.0
 
 
-@dataclass(frozen=True)
-class Shooting:
-    """Discretisation of the rods by multiple shooting.
-
-    Attributes
-    ----------
-    segments : int
-        N, shooting segments per rod.
-    steps : int
-        Runge-Kutta steps per segment.
-    scheme : {"rk4", "rk8"}
-        Runge-Kutta scheme.
-    """
-
-    segments: int = 8
-    steps: int = 4
-    scheme: str = "rk4"
-
-
 class _NotConverged(Exception):
-    def __init__(self, rod: int, residual: float, iterations: int, nodes: np.ndarray, reason: str) -> None:
+    def __init__(self, rod: int, residual: float, iterations: int, unknowns: np.ndarray, reason: str) -> None:
         super().__init__(reason)
-        self.rod, self.residual, self.iterations, self.nodes = rod, residual, iterations, nodes
-
-
-def _invariant_size(nodes: np.ndarray) -> float:
-    return 1.0 + math.hypot(nodes[1], nodes[2]) + nodes[3] ** 2 / 2
-
-
-def _length(step: np.ndarray, load: float) -> float:
-    """Length of a step with forces in units of the load, moments of its root, angles in radians."""
-    theta, n_x, n_y, m = (step[i::4] for i in range(4))
-    scale = 1.0 / (1.0 + load)
-    return math.sqrt(theta @ theta + scale * (m @ m + scale * (n_x @ n_x + n_y @ n_y)))
+        self.rod, self.residual, self.iterations, self.unknowns = rod, residual, iterations, unknowns
 
 
 class _RodState:
-    """One solved rod: normalised pose, nodes, and what the last linear solve gave."""
+    """One solved rod: normalised pose, unknowns, and what the last linear solve gave."""
 
-    __slots__ = ("iterations", "nodes", "pose", "residual", "scalars", "stiffness", "tangent")
+    __slots__ = ("iterations", "load_tangent", "loads", "pose", "residual", "scalars", "tangent", "unknowns")
 
-    def __init__(self, pose, nodes, tangent, stiffness, scalars, residual, iterations):  # type: ignore[no-untyped-def]
+    def __init__(self, pose, unknowns, tangent, loads, load_tangent, scalars, residual, iterations):  # type: ignore[no-untyped-def]
         self.pose = pose  # (3,) tip relative to base / L, clamp angle
-        self.nodes = nodes  # (4N,)
-        self.tangent = tangent  # (4N, 3) d nodes / d pose
-        self.stiffness = stiffness  # (3, 3) d [n_x, n_y, m]_0 / d pose
-        self.scalars = scalars  # (4,) residual, energy, conjugate points, drift
+        self.unknowns = unknowns
+        self.tangent = tangent  # d unknowns / d pose
+        self.loads = loads  # (3,) n_x, n_y, m at the base
+        self.load_tangent = load_tangent  # (3, 3) d loads / d pose
+        self.scalars = scalars  # (5,) residual, step length, energy, conjugate points, drift
         self.residual = residual
         self.iterations = iterations
+
+
+class _RobotState:
+    """All rods as columns, the form in which the graph of a warm step takes and gives them."""
+
+    def __init__(self, rods: list[_RodState]) -> None:
+        self.unknowns = np.stack([rod.unknowns for rod in rods], axis=1)
+        self.tangents = np.concatenate([rod.tangent for rod in rods], axis=1)
+        self.poses = np.stack([rod.pose for rod in rods], axis=1)
+        self.loads = np.stack([rod.loads for rod in rods], axis=1)
+        self.load_tangents = np.concatenate([rod.load_tangent for rod in rods], axis=1)
+        self.scalars = np.stack([rod.scalars for rod in rods], axis=1)
+        self.residual = math.hypot(*(rod.residual for rod in rods))
+        self.iterations = max(rod.iterations for rod in rods)
+
+    def rods(self) -> list[_RodState]:
+        """Split into rods."""
+        return [
+            _RodState(
+                self.poses[:, i].copy(),
+                self.unknowns[:, i].copy(),
+                self.tangents[:, 3 * i : 3 * i + 3].copy(),
+                self.loads[:, i].copy(),
+                self.load_tangents[:, 3 * i : 3 * i + 3].copy(),
+                self.scalars[:, i].copy(),
+                self.residual,
+                self.iterations,
+            )
+            for i in range(self.poses.shape[1])
+        ]
 
 
 class RodSolver:
@@ -81,45 +81,40 @@ class RodSolver:
     Parameters
     ----------
     robot : Robot
-    shooting : Shooting
-        Discretisation.
+    method : RodMethod
 
     Notes
     -----
-    `move` climbs a ladder: tangent predictor and damped Newton; then continuation from the last pose
-    in halved sub-steps; then `ConvergenceError`. It never falls back to a cold start, which could
+    `move` climbs a ladder: tangent predictor and one or two Newton iterations, all rods in one graph; damped
+    Newton, rod by rod; continuation from the last pose in halved sub-steps; then `ConvergenceError`. It never falls back to a cold start, which could
     land on another branch. A failed call leaves the last pose as it was.
     """
 
-    def __init__(self, robot: Robot, shooting: Shooting) -> None:
+    def __init__(self, robot: Robot, method: RodMethod) -> None:
         self.robot = robot
-        self.shooting = shooting
-        newton, residual = rod_newton(shooting.segments, shooting.steps, shooting.scheme)
-        self._newton = BufferedFunction(newton)
-        self._check = BufferedFunction(residual)
-        self._rods: list[_RodState] = []
-        self._inverse_lengths = [1.0 / rod.length for rod in robot.rods]
-        self._force_units = [rod.bending_stiffness / rod.length**2 for rod in robot.rods]
-
-    @property
-    def started(self) -> bool:
-        """Whether there is a pose to move from."""
-        return bool(self._rods)
+        self.method = method
+        self._newton = BufferedFunction(method.newton)
+        self._check = BufferedFunction(method.residual)
+        self._warm = [BufferedFunction(warm_step(robot, method, iterations)) for iterations in (1, 2)]
+        self._state: _RobotState | None = None
+        self._force_units = robot.stiffnesses / robot.lengths**2
+        self._moment_units = robot.stiffnesses / robot.lengths
 
     def start(self, p: np.ndarray, q: np.ndarray, nodes: np.ndarray | None = None) -> None:
-        """Solve at (p, q) from a guess of the nodes, shape (n, 4, N), or cold (None).
+        """Solve at (p, q) from a guess of the nodes, shape (n, 4, any N), or cold (None).
 
         A cold start takes, for each rod, the stable shape of least energy.
         """
         poses = self._poses(p, q)
         try:
             if nodes is not None:
-                self._rods = [
-                    self._solve(i, pose, nodes[i].ravel(order="F").copy(), TOLERANCE)
+                rods = [
+                    self._solve(i, pose, self.method.from_nodes(nodes[i]), TOLERANCE)
                     for i, pose in enumerate(poses)
                 ]
             else:
-                self._rods = [self._cold(i, pose) for i, pose in enumerate(poses)]
+                rods = [self._cold(i, pose) for i, pose in enumerate(poses)]
+            self._state = _RobotState(rods)
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
 
@@ -141,80 +136,89 @@ class RodSolver:
         ConvergenceError
             Neither Newton's method nor continuation got there.
         """
-        poses = self._poses(p, q)
+        state = self._started()
+        for warm in self._warm:
+            warm.inputs[0][:] = p
+            warm.inputs[1][:] = q
+            warm.inputs[2][:] = state.unknowns
+            warm.inputs[3][:] = state.tangents
+            warm.inputs[4][:] = state.poses
+            warm()
+            residual, rough, change, conjugate_points = warm.outputs[6]
+            if residual <= TOLERANCE and rough <= derivatives and change <= _BRANCH_CHANGE and not conjugate_points:
+                (state.unknowns[:], state.tangents[:], state.poses[:], state.loads[:], state.load_tangents[:],
+                 state.scalars[:]) = warm.outputs[:6]  # fmt: skip
+                state.residual, state.iterations = residual, 1 if warm is self._warm[0] else 2
+                return
+        rods, poses = state.rods(), self._poses(p, q)
         try:
-            self._rods = [self._follow(i, pose, derivatives, continuation) for i, pose in enumerate(poses)]
+            rods = [self._follow(i, rods[i], pose, derivatives, continuation) for i, pose in enumerate(poses)]
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
+        self._state = _RobotState(rods)
 
-    def force(self) -> tuple[float, float]:
-        """F = sum n_i = dU/dp at the last pose [N]."""
-        f_x = f_y = 0.0
-        for rod, unit in zip(self._rods, self._force_units, strict=True):
-            f_x += unit * rod.nodes[1]
-            f_y += unit * rod.nodes[2]
-        return f_x, f_y
+    def force(self) -> np.ndarray:
+        """F = sum n_i = dU/dp at the last pose, shape (2,) [N]."""
+        return np.asarray(self._started().loads[:2] @ self._force_units)
 
     def energy(self) -> float:
         """U at the last pose [J]."""
-        return sum(
-            unit * rod.length * state.scalars[1]
-            for unit, rod, state in zip(self._force_units, self.robot.rods, self._rods, strict=True)
-        )
+        return float(self._started().scalars[2] @ self._moment_units)
 
     def unstable_rods(self) -> tuple[int, ...]:
         """Rods with a conjugate point at the last pose."""
-        return tuple(i for i, rod in enumerate(self._rods) if rod.scalars[2] > 0)
+        return tuple(i for i, count in enumerate(self._started().scalars[3].tolist()) if count)
 
     def drift(self) -> float:
         """Largest change of the invariant m^2/2 + n . t along a rod, over its size."""
-        return max(abs(rod.scalars[3]) / _invariant_size(rod.nodes) for rod in self._rods)
+        return max(map(abs, self._started().scalars[4].tolist()))
 
     def jacobians(self) -> tuple[np.ndarray, np.ndarray]:
         """K (2, 2) [N/m] and G (2, n) [N/rad] at the last pose, by implicit differentiation."""
-        k = np.zeros((2, 2))
-        g = np.empty((2, self.robot.n_rods))
-        for i, rod in enumerate(self._rods):
-            k += (self._force_units[i] * self._inverse_lengths[i]) * rod.stiffness[:2, :2]
-            g[:, i] = self._force_units[i] * rod.stiffness[:2, 2]
-        return k, g
+        moves = self._started().load_tangents[:2] * np.repeat(self._force_units, 3)
+        k = moves.reshape(2, -1, 3)[:, :, :2] / self.robot.lengths[:, None]
+        return k.sum(axis=1), moves[:, 2::3]
 
     def equilibrium(self, p: np.ndarray, q: np.ndarray) -> Equilibrium:
         """Everything about the last pose, which was solved at (p, q)."""
+        state = self._started()
         k, g = self.jacobians()
-        moment_units = self.robot.stiffnesses / self.robot.lengths
-        nodes = np.stack([rod.nodes.reshape((4, -1), order="F") for rod in self._rods])
-        stiffness = np.stack([rod.stiffness for rod in self._rods])
-        rod_forces = np.array(self._force_units)[:, None] * nodes[:, 1:3, -1]
+        nodes = [self.method.to_nodes(u, pose[2]) for u, pose in zip(state.unknowns.T, state.poses.T, strict=True)]
         return Equilibrium(
             robot=self.robot,
             p=np.array(p),
             q=np.array(q),
-            method="multiple_shooting",
-            force=np.array(self.force()),
+            method=self.method.name,
+            force=self.force(),
             dforce_dp=k,
             dforce_dq=g,
             # The motor turns the rod's base against its internal moment.
-            motor_torque=-moment_units * nodes[:, 3, 0],
-            dtorque_dq=-moment_units * stiffness[:, 2, 2],
-            energy=float(moment_units @ [rod.scalars[1] for rod in self._rods]),
-            rod_forces=rod_forces,
-            nodes=nodes,
-            residual_norm=math.hypot(*(rod.residual for rod in self._rods)),
-            iterations=max(rod.iterations for rod in self._rods),
+            motor_torque=-self._moment_units * state.loads[2],
+            dtorque_dq=-self._moment_units * state.load_tangents[2, 2::3],
+            energy=self.energy(),
+            rod_forces=(state.loads[:2] * self._force_units).T,
+            nodes=np.stack(nodes),
+            residual_norm=float(state.residual),
+            iterations=state.iterations,
             drift=self.drift(),
             unstable_rods=self.unstable_rods(),
         )
 
+    def _started(self) -> _RobotState:
+        if self._state is None:
+            raise RuntimeError("no pose to start from: call start (or Plant.reset) first")
+        return self._state
+
     def _poses(self, p: np.ndarray, q: np.ndarray) -> list[np.ndarray]:
         x, y = p
         return [
-            np.array([(x - rod.base[0]) * scale, (y - rod.base[1]) * scale, angle])
-            for rod, scale, angle in zip(self.robot.rods, self._inverse_lengths, q, strict=True)
+            np.array([(x - rod.base[0]) / rod.length, (y - rod.base[1]) / rod.length, angle])
+            for rod, angle in zip(self.robot.rods, q, strict=True)
         ]
 
-    def _follow(self, i: int, pose: np.ndarray, derivatives: float, continuation: bool) -> _RodState:
-        start = self._rods[i]
+    def _follow(
+        self, i: int, start: _RodState, pose: np.ndarray, derivatives: float, continuation: bool
+    ) -> _RodState:
         try:
             return self._predict(i, start, pose, derivatives)
         except _NotConverged as failure:
@@ -236,10 +240,11 @@ class RodSolver:
         return state
 
     def _predict(self, i: int, start: _RodState, pose: np.ndarray, derivatives: float) -> _RodState:
-        predicted = start.nodes + start.tangent @ (pose - start.pose)
-        state = self._solve(i, pose, predicted.copy(), derivatives, _WARM_ITERATIONS)
-        if np.abs(state.nodes[0::4] - predicted[0::4]).max() > _BRANCH_ANGLE:
-            raise _NotConverged(i, state.residual, state.iterations, state.nodes, "left its branch")
+        predicted = start.unknowns + start.tangent @ (pose - start.pose)
+        state = self._solve(i, pose, predicted, derivatives, _WARM_ITERATIONS)
+        branch = self.method.branch
+        if np.abs(state.unknowns[branch] - predicted[branch]).max() > _BRANCH_CHANGE:
+            raise _NotConverged(i, state.residual, state.iterations, state.unknowns, "left its branch")
         return state
 
     def _cold(self, i: int, pose: np.ndarray) -> _RodState:
@@ -249,65 +254,62 @@ class RodSolver:
         for coarse in held_shapes(xi, eta):
             shape = coarse.polished(xi, eta) or coarse
             try:
-                state = self._solve(i, pose, shape.nodes(self.shooting.segments, pose[2]).ravel(order="F"), TOLERANCE)
+                state = self._solve(i, pose, self.method.from_shape(shape, pose[2]), TOLERANCE)
             except _NotConverged as failure:
                 last = failure
                 continue
-            if state.scalars[2] == 0:
+            if state.scalars[3] == 0:
                 return state
-            last = _NotConverged(i, state.residual, state.iterations, state.nodes, "found only unstable shapes")
+            last = _NotConverged(i, state.residual, state.iterations, state.unknowns, "found only unstable shapes")
         raise last
 
     @np.errstate(all="ignore")  # an overflow is a bad trial point, and rejected
     def _solve(
-        self, i: int, pose: np.ndarray, nodes: np.ndarray, derivatives: float, most: int = MAX_ITERATIONS
+        self, i: int, pose: np.ndarray, unknowns: np.ndarray, derivatives: float, most: int = MAX_ITERATIONS
     ) -> _RodState:
-        """Damped Newton from ``nodes``.
+        """Damped Newton from ``unknowns``.
 
         A step is kept if the next Newton step is shorter or the residual smaller. The residual alone will not
         do: on a taut rod (condition 1e8) it rises by orders of magnitude on a step that lands next to the
         solution.
         """
         newton, check = self._newton, self._check
-        nodes[0] = pose[2]
-        newton.inputs[1][:] = check.inputs[1][:] = pose[:2]
-        load = math.hypot(nodes[1], nodes[2])
-        tolerance = TOLERANCE * (1.0 + load)
-        newton.inputs[0][:] = nodes
+        newton.inputs[0][:] = unknowns
+        newton.inputs[1][:] = check.inputs[1][:] = pose
         newton()
-        residual = newton.outputs[3][0]
+        step, scalars = newton.outputs[0], newton.outputs[4]
         for iteration in range(1, most + 1):
-            if residual <= tolerance:
-                return self._state(pose, nodes, residual, iteration)
+            residual, length = scalars[0], scalars[1]
+            if residual <= TOLERANCE:
+                return self._rod_state(pose, unknowns, newton.outputs[2], residual, iteration)
             if residual <= derivatives:
-                trial = nodes + newton.outputs[0]
+                trial = unknowns + step
                 check.inputs[0][:] = trial
                 check()
-                if check.outputs[0][0] <= tolerance:
-                    return self._state(pose, trial, check.outputs[0][0], iteration)
-            step = newton.outputs[0].copy()
-            length = _length(step, load)
-            size = 1.0
+                if check.outputs[0][0] <= TOLERANCE:
+                    return self._rod_state(pose, trial, check.outputs[1], check.outputs[0][0], iteration)
+            direction, size = step.copy(), 1.0
             while True:
-                newton.inputs[0][:] = trial = nodes + size * step
+                newton.inputs[0][:] = trial = unknowns + size * direction
                 newton()
-                trial_residual = newton.outputs[3][0]
                 # Written so that NaN is a failure.
                 if (
-                    trial_residual <= max((1.0 - 0.1 * size) * residual, tolerance)
-                    or _length(newton.outputs[0], load) <= (1.0 - 0.25 * size) * length
+                    scalars[0] <= max((1.0 - 0.1 * size) * residual, TOLERANCE)
+                    or scalars[1] <= (1.0 - 0.25 * size) * length
                 ):
                     break
                 size /= 2
                 if size < 1e-3:
-                    raise _NotConverged(i, residual, iteration, nodes, "no descent")
-            nodes, residual = trial, trial_residual
-        raise _NotConverged(i, residual, most, nodes, "too many iterations")
+                    raise _NotConverged(i, residual, iteration, unknowns, "no descent")
+            unknowns = trial
+        raise _NotConverged(i, scalars[0], most, unknowns, "too many iterations")
 
-    def _state(self, pose: np.ndarray, nodes: np.ndarray, residual: float, iterations: int) -> _RodState:
-        _, tangent, stiffness, scalars = self._newton.outputs
+    def _rod_state(
+        self, pose: np.ndarray, unknowns: np.ndarray, loads: np.ndarray, residual: float, iterations: int
+    ) -> _RodState:
+        _, tangent, _, load_tangent, scalars = self._newton.outputs
         return _RodState(
-            pose, nodes, tangent.copy(), stiffness.copy(), scalars.copy(), float(residual), iterations
+            pose, unknowns, tangent.copy(), loads.copy(), load_tangent.copy(), scalars.copy(), float(residual), iterations
         )
 
     def _error(self, failure: _NotConverged, p: np.ndarray, q: np.ndarray) -> ConvergenceError:
@@ -320,5 +322,5 @@ class RodSolver:
             rod=failure.rod,
             residual=failure.residual,
             iterations=failure.iterations,
-            last=failure.nodes,
+            last=failure.unknowns,
         )

@@ -59,10 +59,9 @@ class SingleShooting:
         assert self._last is not None
         self._last = self._solve(p, q, self._last.nodes)
 
-    def force(self) -> tuple[float, float]:
-        """F at the last pose [N]."""
-        f_x, f_y = self._solution().force
-        return f_x, f_y
+    def force(self) -> np.ndarray:
+        """F at the last pose, shape (2,) [N]."""
+        return self._solution().force
 
     def jacobians(self) -> tuple[np.ndarray, np.ndarray]:
         """K (2, 2) [N/m] and G (2, n) [N/rad] at the last pose."""
@@ -133,11 +132,11 @@ class SingleShooting:
         sensitivity = -np.linalg.solve(evaluate.outputs[1], evaluate.outputs[2])
         base_loads = y[:-2].reshape(n, 3)
         solved = np.concatenate([q[:, None], base_loads / units], axis=1)[:, :, None]
-        scalars = np.empty((n, 4))
+        scalars = np.empty((n, 5))
         for i, rod in enumerate(self.robot.rods):
             sampled = sample_rod(solved[i], 9)[2:, :8]
-            scalars[i] = self._judge(sampled.ravel(order="F"), (p - rod.base) / rod.length)[3].full().ravel()
-        size = 1.0 + np.hypot(solved[:, 1, 0], solved[:, 2, 0]) + solved[:, 3, 0] ** 2 / 2
+            pose = np.append((p - rod.base) / rod.length, q[i])
+            scalars[i] = self._judge(sampled.ravel(order="F"), pose)[4].full().ravel()
         return Equilibrium(
             robot=self.robot,
             p=p.copy(),
@@ -148,11 +147,11 @@ class SingleShooting:
             dforce_dq=sensitivity[-2:, 2:].copy(),
             motor_torque=-base_loads[:, 2],
             dtorque_dq=-np.diagonal(sensitivity[2:-2:3, 2:]).copy(),
-            energy=float((self.robot.stiffnesses / self.robot.lengths) @ scalars[:, 1]),
+            energy=float((self.robot.stiffnesses / self.robot.lengths) @ scalars[:, 2]),
             rod_forces=base_loads[:, :2].copy(),
             nodes=solved,
             residual_norm=norm,
             iterations=evaluations,
-            drift=float(np.max(np.abs(scalars[:, 3]) / size)),
-            unstable_rods=tuple(int(i) for i in np.flatnonzero(scalars[:, 2] > 0)),
+            drift=float(np.abs(scalars[:, 4]).max()),
+            unstable_rods=tuple(int(i) for i in np.flatnonzero(scalars[:, 3] > 0)),
         )

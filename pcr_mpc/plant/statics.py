@@ -11,14 +11,15 @@ import numpy as np
 from ..errors import ConvergenceError, checked_vector
 from .equilibrium import Equilibrium
 from .robot import Robot
-from .rod import SCHEMES, sample_rod
-from .rod_solver import RodSolver, Shooting
+from .rod import SCHEMES
+from .rod_method import Shooting, closed_form_method, shooting_method
+from .rod_solver import RodSolver
 from .single_shooting import SingleShooting
 
 # (steps per segment, scheme), tried in turn until the drift is small enough.
 _REFINEMENT = ((4, "rk4"), (4, "rk8"), (12, "rk8"))
 _WANTED_DRIFT = 1e-6
-METHODS = ("multiple_shooting", "single_shooting")
+METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 
 
 def solve_statics(
@@ -26,7 +27,7 @@ def solve_statics(
     p: Any,
     q: Any,
     *,
-    method: str = "multiple_shooting",
+    method: str = "closed_form",
     segments: int = 8,
     steps: int | None = None,
     scheme: str = "rk4",
@@ -75,15 +76,15 @@ def solve_statics(
     """
     p, q = checked_vector("p", p, 2), checked_vector("q", q, robot.n_rods)
     robot.require_reachable(p)
-    if steps is None:
+    if steps is None and method != "closed_form":
         return _refined(robot, p, q, method, segments, guess)
-    shooting = checked_shooting(segments, steps, scheme)
+    shooting = checked_shooting(segments, steps or 1, scheme)
     solver = _solver(robot, method, shooting, threading.get_ident())
     if isinstance(guess, Equilibrium):
-        solver.start(guess.p, guess.q, resampled(_of(robot, guess), segments))
+        solver.start(guess.p, guess.q, _of(robot, guess).nodes)
         solver.move(p, q)
     else:
-        solver.start(p, q, None if guess is None else _checked_nodes(guess, robot, segments))
+        solver.start(p, q, None if guess is None else _checked_nodes(guess, robot))
     return solver.equilibrium(p, q)
 
 
@@ -134,8 +135,10 @@ def _solver(robot: Robot, method: str, shooting: Shooting, thread: int) -> RodSo
 
 def make_solver(robot: Robot, method: str, shooting: Shooting) -> RodSolver | SingleShooting:
     """Build the solver that goes by the name ``method``."""
+    if method == "closed_form":
+        return RodSolver(robot, closed_form_method())
     if method == "multiple_shooting":
-        return RodSolver(robot, shooting)
+        return RodSolver(robot, shooting_method(shooting))
     if method == "single_shooting":
         return SingleShooting(robot, shooting.segments * shooting.steps, shooting.scheme)
     raise ValueError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
@@ -147,16 +150,10 @@ def _of(robot: Robot, guess: Equilibrium) -> Equilibrium:
     return guess
 
 
-def resampled(guess: Equilibrium, segments: int) -> np.ndarray:
-    """Nodes of an equilibrium at another number of segments, shape (n, 4, segments)."""
-    if guess.nodes.shape[2] == segments:
-        return guess.nodes
-    return np.stack([sample_rod(nodes, segments + 1)[2:, :segments] for nodes in guess.nodes])
-
-
-def _checked_nodes(guess: np.ndarray, robot: Robot, segments: int) -> np.ndarray:
+def _checked_nodes(guess: np.ndarray, robot: Robot) -> np.ndarray:
     nodes = np.asarray(guess, dtype=float)
-    expected = (robot.n_rods, 4, segments)
-    if nodes.shape != expected or not np.isfinite(nodes).all():
-        raise ValueError(f"guess has shape {nodes.shape} (finite: {np.isfinite(nodes).all()}), expected {expected}")
+    if nodes.ndim != 3 or nodes.shape[:2] != (robot.n_rods, 4) or not np.isfinite(nodes).all():
+        raise ValueError(
+            f"guess has shape {nodes.shape} (finite: {np.isfinite(nodes).all()}), expected ({robot.n_rods}, 4, N)"
+        )
     return nodes

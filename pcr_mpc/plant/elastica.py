@@ -1,0 +1,136 @@
+"""The rod in closed form: Jacobi elliptic functions, exact for a uniform weightless rod.
+
+A rod with a moment-free tip is half a swing of the pendulum delta'' = sin(delta), u = lambda * (distance from
+the tip), released at rest at the tip from delta = tip_angle (see `chart`). With k' = sin(tip_angle / 2) and
+k = cos(tip_angle / 2),
+
+    sin(delta/2) = k' nd(u),    cos(delta/2) = k cd(u),    delta' = int sin(delta) du = 2 k k' sd(u),
+    int cos(delta) du = u - 2 (E(am u) - k^2 sn(u) cd(u)),
+
+so (log tip_angle, lambda) gives the tip, the force and the moment explicitly, and statics is a 2 x 2 Newton
+iteration per rod. The logarithm is the variable because a taut rod has tip_angle of the order of exp(-lambda).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .rod import sample_rod
+
+# Ascending Landen steps: k' falls below 1e-16 from any k >= 1e-6.
+_LANDEN_STEPS = 8
+
+
+def elliptic(u: Any, k: Any, k_prime: Any) -> tuple[Any, Any, Any, Any]:
+    """Sn, cn, dn and E(am u) by ascending Landen transformations, with a fixed number of operations.
+
+    The modulus is driven to 1, where the functions are hyperbolic, so that k' may be as small as it likes
+    (DLMF 22.7.6-8 and 19.8.13; k and k' are both arguments, for neither may come from the other).
+    """
+    moduli, factor = [], ca.SX(1)
+    for _ in range(_LANDEN_STEPS):
+        moduli.append((k, k_prime))
+        factor *= (1 + k) / 2
+        k, k_prime = 2 * ca.sqrt(k) / (1 + k), (k_prime / (1 + k)) ** 2
+    u = u * factor
+    sn, dn = ca.tanh(u), 1 / ca.cosh(u)
+    cn, epsilon = dn, sn
+    for k, k_prime in reversed(moduli):
+        up = (k_prime / (1 + k)) ** 2  # complementary modulus one step up
+        ratio = up / dn
+        sn, cn, dn = 2 / (1 + k) * sn * cn / dn, (1 + k) / (2 * k) * (dn - ratio), (1 + k) / 2 * (dn + ratio)
+        epsilon = (1 + k) * epsilon + k_prime**2 / (1 + k) * u - k * sn
+        u = u * 2 / (1 + k)
+    return sn, cn, dn, epsilon
+
+
+def pendulum(log_tip_angle: Any, u: Any) -> tuple[Any, Any, Any]:
+    """Angle delta, its rate d delta/du and int cos(delta) du at u."""
+    half = ca.exp(log_tip_angle) / 2
+    k, k_prime = ca.cos(half), ca.sin(half)
+    sn, cn, dn, epsilon = elliptic(u, k, k_prime)
+    delta = 2 * ca.atan2(k_prime / dn, k * cn / dn)
+    return delta, 2 * k * sn * (k_prime / dn), u - 2 * (epsilon - k * k * sn * cn / dn)
+
+
+@lru_cache
+def rod_newton() -> tuple[Any, Any]:
+    """Build the graphs of one rod; same arguments and results as `multiple_shooting.rod_newton`.
+
+    The unknowns are [log tip_angle, lambda, hand], of which the hand (+1 turns left at the tip, -1 is the
+    mirror image) takes no step: it changes only through a straight rod.
+    """
+    unknowns, pose = ca.SX.sym("unknowns", 3), ca.SX.sym("pose", 3)
+    load, hand = unknowns[1], unknowns[2]
+    delta, rate, c = pendulum(unknowns[0], load)
+    cos, sin = ca.cos(delta), ca.sin(delta)
+    # Tip seen from the clamp, mirrored for the right hand: s = int sin(delta) du is the rate.
+    tip = ca.vertcat(cos * c + sin * rate, sin * c - cos * rate) / load
+    turn = ca.vertcat(
+        ca.horzcat(ca.cos(pose[2]), ca.sin(pose[2])), hand * ca.horzcat(-ca.sin(pose[2]), ca.cos(pose[2]))
+    )
+    target = turn @ pose[:2]
+    psi = pose[2] + hand * delta
+    loads = ca.vertcat(load**2 * ca.cos(psi), load**2 * ca.sin(psi), hand * load * rate)
+
+    residual = tip - target
+    jacobian = ca.jacobian(tip, unknowns[:2])
+    determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+    inverse = ca.vertcat(
+        ca.horzcat(jacobian[1, 1], -jacobian[0, 1]), ca.horzcat(-jacobian[1, 0], jacobian[0, 0])
+    ) / determinant  # fmt: skip
+    step = -(inverse @ residual)
+    # Implicit function theorem: the unknowns follow the target.
+    moves = inverse @ ca.jacobian(target, pose)
+    load_moves = ca.jacobian(loads, unknowns[:2]) @ moves + ca.jacobian(loads, pose)
+    energy = load**2 * ca.cos(ca.exp(unknowns[0])) - load * c
+    norm = ca.norm_2(residual)
+    # The determinant is negative on the stable sheet, and its first zero is the limit of stability.
+    scalars = ca.vertcat(norm, ca.norm_2(step), energy, determinant >= 0, 0)
+    results = [ca.vertcat(step, 0), ca.vertcat(moves, ca.SX(1, 3)), loads, load_moves, scalars]
+    options = {"cse": True}
+    newton = ca.Function("rod_newton", [unknowns, pose], [ca.densify(r) for r in results], options)
+    return newton, ca.Function("rod_residual", [unknowns, pose], [norm, loads], options)
+
+
+@lru_cache
+def _nodes(n_nodes: int) -> Any:
+    unknowns, angle = ca.SX.sym("unknowns", 3), ca.SX.sym("angle")
+    hand, load = unknowns[2], unknowns[1]
+    states = [pendulum(unknowns[0], load * (1 - j / n_nodes))[:2] for j in range(n_nodes)]
+    base = states[0][0]
+    columns = [
+        ca.vertcat(
+            angle + hand * (base - delta),
+            load**2 * ca.cos(angle + hand * base),
+            load**2 * ca.sin(angle + hand * base),
+            hand * load * rate,
+        )
+        for delta, rate in states
+    ]
+    return ca.Function("nodes", [unknowns, angle], [ca.horzcat(*columns)], {"cse": True})
+
+
+def nodes(unknowns: np.ndarray, angle: float, n_nodes: int) -> np.ndarray:
+    """States [theta, n_x, n_y, m] at s = j/n_nodes, shape (4, n_nodes), normalised."""
+    return np.asarray(_nodes(n_nodes)(unknowns, angle).full())
+
+
+def from_nodes(states: np.ndarray) -> np.ndarray:
+    """Unknowns near given nodal states, shape (4, N); exact only as a start for Newton's method."""
+    load = float(np.sqrt(np.hypot(*states[1:3, 0])))
+    psi = np.arctan2(states[2, 0], states[1, 0])
+    theta = np.append(states[0], sample_rod(states, 2)[2, -1])
+    delta = np.angle(np.exp(1j * (psi - theta)))
+    u = load * np.append(1 - np.arange(states.shape[1]) / states.shape[1], 0.0)
+    # The last place at which delta is above rounding: the tip itself, unless the rod is taut there.
+    last = np.flatnonzero(np.abs(delta) > 1e-5)
+    j = int(last[-1]) if last.size else 0
+    size = max(abs(float(delta[j])), 1e-12)
+    # From there on a taut rod is on the separatrix, tan(delta/4) = tan(tip_angle/4) cosh(u).
+    log_tip_angle = np.log(4.0 * np.tan(size / 4.0)) - np.logaddexp(u[j], -u[j]) + np.log(2.0) if u[j] else np.log(size)
+    return np.array([log_tip_angle, load, np.sign(delta[j]) or 1.0])

@@ -1,0 +1,151 @@
+"""The ways to solve a rod, seen from the solver alike: graphs, and what their unknowns mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from . import elastica, multiple_shooting
+from .chart import HeldShape
+from .robot import Robot
+from .rod import sample_rod
+
+# Graphs up to this size are inlined into the graph of the whole robot; larger ones are called by it.
+_INLINED_INSTRUCTIONS = 4000
+
+
+@dataclass(frozen=True)
+class Shooting:
+    """Discretisation of the rods by shooting.
+
+    Attributes
+    ----------
+    segments : int
+        N, shooting segments per rod.
+    steps : int
+        Runge-Kutta steps per segment.
+    scheme : {"rk4", "rk8"}
+        Runge-Kutta scheme.
+    """
+
+    segments: int = 8
+    steps: int = 4
+    scheme: str = "rk4"
+
+
+@dataclass(frozen=True, eq=False)
+class RodMethod:
+    """One way to solve a rod: its graphs, and how its unknowns relate to shapes.
+
+    Attributes
+    ----------
+    name : str
+    newton, residual : casadi.Function
+        See `multiple_shooting.rod_newton`.
+    branch : slice
+        The unknowns of order one that a warm start may not change much.
+    from_shape : callable
+        (shape, clamp angle) -> unknowns: a cold start.
+    from_nodes : callable
+        nodes (4, N) -> unknowns: a start from an equilibrium or a guess.
+    to_nodes : callable
+        (unknowns, clamp angle) -> nodes (4, N).
+    """
+
+    name: str
+    newton: Any
+    residual: Any
+    branch: slice
+    from_shape: Callable[[HeldShape, float], np.ndarray]
+    from_nodes: Callable[[np.ndarray], np.ndarray]
+    to_nodes: Callable[[np.ndarray, float], np.ndarray]
+
+
+@lru_cache
+def shooting_method(shooting: Shooting) -> RodMethod:
+    """Multiple shooting, paper sec. 4; the unknowns are the nodes."""
+    n = shooting.segments
+    newton, residual = multiple_shooting.rod_newton(n, shooting.steps, shooting.scheme)
+
+    def from_nodes(nodes: np.ndarray) -> np.ndarray:
+        same = nodes.shape[1] == n
+        return (nodes if same else sample_rod(nodes, n + 1)[2:, :n]).ravel(order="F")
+
+    return RodMethod(
+        name="multiple_shooting",
+        newton=newton,
+        residual=residual,
+        branch=slice(0, None, 4),
+        from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
+        from_nodes=from_nodes,
+        to_nodes=lambda unknowns, _: unknowns.reshape((4, n), order="F").copy(),
+    )
+
+
+@lru_cache
+def closed_form_method() -> RodMethod:
+    """Elliptic functions: exact for the uniform, straight, weightless rods that a `Robot` describes."""
+    newton, residual = elastica.rod_newton()
+    return RodMethod(
+        name="closed_form",
+        newton=newton,
+        residual=residual,
+        branch=slice(0, 2),
+        from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
+        from_nodes=elastica.from_nodes,
+        to_nodes=lambda unknowns, angle: elastica.nodes(unknowns, angle, 8),
+    )
+
+
+@lru_cache(maxsize=16)
+def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
+    """Tangent predictor, a fixed number of Newton iterations and the verdict, for the whole robot in one graph.
+
+    Nothing is decided in here: the caller reads the verdict, and keeps the result or takes the slow way.
+
+    Returns
+    -------
+    casadi.Function
+        (p (2), q (n), unknowns (u, n), tangents (u, 3n), poses (3, n)) of the last pose ->
+        unknowns, tangents, poses, loads (3, n), load_tangents (3, 3n), scalars (5, n) of the new one;
+        verdict (4) = [largest residual, largest residual where the derivatives were taken, largest change of an
+        unknown of the branch beyond the prediction, number of conjugate points]; force (2) [N]; K (2, 2) [N/m];
+        G (2, n) [N/rad].
+    """
+    n, width = robot.n_rods, method.newton.size1_in(0)
+    p, q = ca.MX.sym("p", 2), ca.MX.sym("q", n)
+    unknowns, tangents = ca.MX.sym("unknowns", width, n), ca.MX.sym("tangents", width, 3 * n)
+    poses = ca.MX.sym("poses", 3, n)
+    branch = list(range(width))[method.branch]
+    columns: dict[str, list[Any]] = {name: [] for name in ("u", "t", "pose", "loads", "load_t", "scalars")}
+    residuals, roughest, changes = [], [], []
+    force, k, g = ca.MX(2, 1), ca.MX(2, 2), []
+    for i, rod in enumerate(robot.rods):
+        pose = ca.vertcat((p - ca.DM(rod.base)) / rod.length, q[i])
+        start = tangents[:, 3 * i : 3 * i + 3]
+        u = predicted = unknowns[:, i] + start @ (pose - poses[:, i])
+        for _ in range(iterations):
+            step, tangent, _, load_tangent, scalars = method.newton(u, pose)
+            u = u + step
+        residual, loads = method.residual(u, pose)
+        for name, value in zip(columns, (u, tangent, pose, loads, load_tangent, scalars), strict=True):
+            columns[name].append(value)
+        residuals.append(residual)
+        roughest.append(scalars[0])
+        changes.append(ca.norm_inf((u - predicted)[branch]))
+        unit = rod.bending_stiffness / rod.length**2
+        force += unit * loads[:2]
+        k += unit / rod.length * load_tangent[:2, :2]
+        g.append(unit * load_tangent[:2, 2])
+    conjugate_points = sum(scalars[3] for scalars in columns["scalars"])
+    # Sums, not maxima, of what may be NaN: fmax would drop it.
+    verdict = ca.vertcat(sum(residuals), sum(roughest), sum(changes), conjugate_points)
+    results = [*(ca.horzcat(*blocks) for blocks in columns.values()), verdict, force, k, ca.horzcat(*g)]
+    function = ca.Function("warm_step", [p, q, unknowns, tangents, poses], results)
+    small = method.newton.n_instructions() <= _INLINED_INSTRUCTIONS
+    return function.expand("warm_step", {"cse": True}) if small else function
