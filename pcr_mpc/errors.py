@@ -5,6 +5,7 @@ The numbers are keyword attributes of the exception (``error.residual``), and su
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,7 @@ def checked_vector(name: str, value: Any, size: int) -> np.ndarray:
     array = np.ascontiguousarray(value, dtype=float)
     if array.shape != (size,):
         raise ValueError(f"{name} has shape {array.shape}, expected ({size},)")
-    if not np.isfinite(array).all():
+    # One dot product is the cheapest test; it may overflow, so its verdict is only final when it passes.
+    if not math.isfinite(array @ array) and not np.isfinite(array).all():
         raise ValueError(f"{name} is not finite: {array}")
     return array

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..errors import InfeasibleError
 from ..linearisation.model import LinearModel
-from .osqp_solver import QPSolver
-from .qp import Reference, build_qp, constraint_matrix
+from .osqp_solver import QPSolver, Solution
+from .qp import QuadraticProgram, Reference, build_qp, constraint_matrix
 from .tuning import Limits, Tuning
 
 
@@ -38,7 +38,7 @@ class Plan:
     primal_residual, dual_residual : float
         Recomputed from the QP's data; NaN if unsolved.
     update_time, solve_time : float
-        Assembling and handing over the QP, and solving it [s].
+        Assembling the QP, and handing it over and solving it [s].
     """
 
     inputs: np.ndarray
@@ -76,7 +76,9 @@ class LinearMPC:
     def __init__(self, tuning: Tuning, limits: Limits) -> None:
         self.tuning = tuning
         self.limits = limits
+        self._rates_only: QPSolver | None = None
         self._solver: QPSolver | None = None
+        self._dense = np.empty((0, 0))
         self._terminal_weight: np.ndarray | None = None
         self._last: Plan | None = None
 
@@ -84,8 +86,9 @@ class LinearMPC:
         """Start afresh: the same calls then give the same plans, bit for bit."""
         self._last = None
         self._terminal_weight = None
-        if self._solver is not None:
-            self._solver.reset()
+        for solver in (self._rates_only, self._solver):
+            if solver is not None:
+                solver.reset()
 
     def solve(
         self,
@@ -117,24 +120,27 @@ class LinearMPC:
         n = first.B.shape[1]
         if self._terminal_weight is None:
             self._terminal_weight = terminal_weight(first, self.tuning)
-        if self._solver is None:
+        if self._solver is None or self._rates_only is None:
             matrix = constraint_matrix(self.tuning.horizon, n, first.dt)
-            self._solver = QPSolver(matrix, self.tuning.tolerance, self.tuning.max_iterations)
+            settings = self.tuning.tolerance, self.tuning.max_iterations
+            self._dense = matrix.toarray()
+            self._solver = QPSolver(matrix, *settings)
+            self._rates_only = QPSolver(matrix[: matrix.shape[1]].tocsc(), *settings)
         qp = build_qp(x, models, reference, u_previous, self.tuning, self.limits, self._terminal_weight)
+        warm = None if self._last is None else _shifted(self._last.inputs).ravel()
+        updated = time.perf_counter()
         try:
-            self._solver.update(qp.P, qp.q, qp.l, qp.u)
-            if self._last is not None:
-                self._solver.warm_start(_shifted(self._last.inputs).ravel())
-            updated = time.perf_counter()
-            solution = self._solver.solve()
+            solution = self._solve(qp, self._rates_only, self._solver, warm)
         except InfeasibleError as error:
             self._last = self._fall_back(error, x, models, time.perf_counter() - began)
             return self._last
         solved = time.perf_counter()
         inputs = solution.x.reshape(-1, n)
         # OSQP meets bounds to its tolerance; what is applied meets them exactly.
-        inputs[0] = np.clip(inputs[0], np.maximum(qp.l[:n], qp.l[n * len(inputs) :][:n]),
-                            np.minimum(qp.u[:n], qp.u[n * len(inputs) :][:n]))  # fmt: skip
+        first_change = n * len(inputs)
+        lower = np.maximum(qp.l[:n], qp.l[first_change : first_change + n])
+        upper = np.minimum(qp.u[:n], qp.u[first_change : first_change + n])
+        inputs[0] = np.minimum(np.maximum(inputs[0], lower), upper)
         self._last = Plan(
             inputs=inputs,
             x=x.copy(),
@@ -148,6 +154,24 @@ class LinearMPC:
             solve_time=solved - updated,
         )
         return self._last
+
+    def _solve(self, qp: QuadraticProgram, rates_only: QPSolver, complete: QPSolver, warm: np.ndarray | None) -> Solution:
+        """Solve with the rates' rows alone; where that breaks another row, with all of them.
+
+        An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half.
+        """
+        n_rates = rates_only.m
+        rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
+        if warm is not None:
+            rates_only.warm_start(warm)
+        solution = rates_only.solve()
+        rows = self._dense @ solution.x
+        broken = max(float((qp.l - rows).max()), float((rows - qp.u).max()), 0.0)
+        if broken <= self.tuning.tolerance:
+            return Solution(solution.x, solution.y, solution.iterations, broken, solution.dual_residual)
+        complete.update(qp.P, qp.q, qp.l, qp.u)
+        complete.warm_start(solution.x)
+        return complete.solve()
 
     def _fall_back(
         self, error: InfeasibleError, x: np.ndarray, models: LinearModel | Sequence[LinearModel], spent: float

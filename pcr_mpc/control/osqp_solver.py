@@ -7,15 +7,18 @@ checked before it is handed over, every return code is read, and x exists only i
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import osqp
 import scipy.sparse as sp
+from scipy.linalg.blas import dspmv
 
 from ..errors import InfeasibleError
 
 _RHO = 0.1
+_INFINITY = 1e30
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +62,12 @@ class QPSolver:
         starts = np.arange(n + 1) * (np.arange(n + 1) + 1) // 2
         diagonal = (rows == np.repeat(np.arange(n), np.arange(1, n + 1))).astype(float)
         hessian = sp.csc_matrix((diagonal, rows, starts), shape=(n, n))
-        self._upper = np.triu_indices(n)
-        self._full = np.zeros((n, n))
-        self._a = sp.csr_matrix(A)
         self._dense_a = np.ascontiguousarray(A.toarray())
         self._osqp = osqp.OSQP()
         self._osqp.setup(
             hessian, np.zeros(n), A, -np.ones(m), np.ones(m), verbose=False, eps_abs=tolerance, eps_rel=tolerance,
             max_iter=max_iterations, adaptive_rho=1, rho=_RHO, scaling=2, check_termination=5, polishing=False,
         )  # fmt: skip
-        self._columns = np.repeat(np.arange(n), np.arange(1, n + 1))
-        self._rows = rows
 
     def reset(self) -> None:
         """Forget the last solution and the adapted step size, for a reproducible start."""
@@ -140,23 +138,23 @@ class QPSolver:
 
     def _residuals(self, x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
         hessian, q, lower, upper = self._data
-        full = self._full
-        full[self._rows, self._columns] = hessian
-        full[self._columns, self._rows] = hessian
         ax = self._dense_a @ x
         primal = max(float((lower - ax).max()), float((ax - upper).max()), 0.0)
-        dual = float(np.abs(full @ x + q + y @ self._dense_a).max())
-        return primal, dual
+        # The upper triangle column by column is BLAS's packed form.
+        gradient = dspmv(self.n, 1.0, hessian, x) + q + y @ self._dense_a
+        return primal, float(np.abs(gradient).max())
 
     @staticmethod
     def _checked(name: str, value: np.ndarray, size: int, bound: bool = False) -> np.ndarray:
         array = np.ascontiguousarray(value, dtype=float)
         if array.shape != (size,):
             raise ValueError(f"{name} has shape {array.shape}, expected ({size},)")
-        if np.isnan(array).any() if bound else not np.isfinite(array).all():
+        # The sum of squares is NaN if any entry is, and at most inf otherwise.
+        squares = float(array @ array)
+        if math.isnan(squares) or (not bound and not squares < math.inf and not np.isfinite(array).all()):
             raise ValueError(f"{name} is not finite")
         # OSQP's infinity is 1e30: larger bounds are refused by it.
-        return np.clip(array, -1e30, 1e30) if bound else array
+        return np.clip(array, -_INFINITY, _INFINITY) if bound and squares >= _INFINITY**2 else array
 
     @staticmethod
     def _require(code: int | None, call: str) -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from tqdm import tqdm
 
 from ..control.mpc import LinearMPC, Plan
 from ..control.qp import Reference
@@ -147,7 +146,7 @@ def feed_forward(
     samples = scene.trajectory(t)
     states = np.empty((len(t), 4 + robot.n_rods))
     eq = pose
-    for k in tqdm(range(len(t)), desc="inverse dynamics", unit="step", leave=False, delay=1.0):
+    for k in range(len(t)):
         p, v, a = samples[k]
         try:
             eq = inverse_statics(robot, p, -robot.tip_mass * a - robot.drag * v, guess=eq)
@@ -157,8 +156,17 @@ def feed_forward(
     return states, np.diff(states[:, 4:], axis=0) / scene.period
 
 
-def make_controller(scene: Scene, tuning: Tuning | None, **options: Any) -> Controller:
-    """Build the controller of a scene: the MPC, or none where there is nothing to track."""
+def make_controller(scene: Scene, tuning: Tuning | None = None, robot: Robot | None = None) -> Controller:
+    """Build the controller of a scene: the MPC, or none where there is nothing to track.
+
+    Parameters
+    ----------
+    tuning : Tuning, optional
+        Instead of the scene's own.
+    robot : Robot, optional
+        What the controller believes the robot to be.
+    """
+    tuning = tuning or scene.tuning
     if scene.trajectory is None or tuning is None:
         return HoldMotors(scene.robot.n_rods)
-    return TrackingMPC(scene, tuning, **options)
+    return TrackingMPC(scene, tuning, robot)

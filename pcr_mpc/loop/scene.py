@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError
 from ..plant.dynamics import INTEGRATORS, Plant
 from ..plant.equilibrium import Equilibrium
@@ -53,6 +54,8 @@ class Scene:
     plant : PlantSettings
     period : float
         Control period [s], a multiple of the plant's step.
+    tuning : Tuning or None
+        Of the scene's controller. None: the motors stay where they are.
     force : (float, float)
         External force on the tip, unknown to the controller [N].
     tip_noise : float
@@ -69,6 +72,7 @@ class Scene:
     trajectory: Trajectory | None
     plant: PlantSettings
     period: float
+    tuning: Tuning | None
     force: tuple[float, float]
     tip_noise: float
 
@@ -103,7 +107,7 @@ class Scene:
 
 
 def load_scene(path: str | Path) -> Scene:
-    """Read a scene from TOML (see ``models/scenes/lemniscate.toml``); its robot's path is relative to it.
+    """Read a scene from TOML (see ``models/scenes/lemniscate.toml``); paths of its robot and tuning are relative to it.
 
     Raises
     ------
@@ -138,6 +142,7 @@ def load_scene(path: str | Path) -> Scene:
             )
         with file.table("control") as control:
             period = control.number("period", above=0.0)
+            tuning = control.text("tuning", None)
             ratio = period / plant.dt
             if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio:
                 raise control.fail("period", f"is {period} s, not a multiple of the plant's step {plant.dt} s")
@@ -146,7 +151,14 @@ def load_scene(path: str | Path) -> Scene:
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
         with file.table("reference") as reference:
             trajectory = _trajectory(reference)
-    scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period, force, noise)
+    scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
+                  tuning and load_tuning(file.path.parent / tuning), force, noise)  # fmt: skip
+    if (trajectory is None) != (tuning is None):
+        raise ModelError(
+            f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",
+            file=str(path),
+            key="control.tuning",
+        )
     if tip is not None and trajectory is not None:
         begin = trajectory(np.zeros(1))[0, 0]
         if np.hypot(*(begin - tip)) > 1e-9:

@@ -129,7 +129,8 @@ class Plant:
         """
         self._at = None  # the last solve may have been content with rougher derivatives
         self._go(p, q, accuracy)
-        return self._solver.force(), *self._solver.jacobians()
+        k, g = self._solver.jacobians()
+        return self._solver.force(), k, g
 
     def equilibrium(self, x: Any) -> Equilibrium:
         """Everything about the rods at state x, following the branch."""
@@ -142,9 +143,12 @@ class Plant:
         at = (*p.tolist(), *q.tolist())
         if at == self._at:
             return
-        self.robot.require_reachable(p)
         self._at = None
-        self._solver.move(p, q, derivatives=derivatives)
+        try:
+            self._solver.move(p, q, derivatives=derivatives)
+        except ConvergenceError:
+            self.robot.require_reachable(p)  # the plainer reason, if it is the reason
+            raise
         unstable = self._solver.unstable_rods()
         if unstable:
             raise UnstableError(

@@ -20,6 +20,7 @@ _WARM_ITERATIONS = 8
 TOLERANCE = 1e-10
 # A warm start whose unknowns move further than this beyond the prediction may have left its branch.
 _BRANCH_CHANGE = 0.3
+_ROUGH = 1e-4
 _SMALLEST_SUBSTEP = 1.0 / 64.0
 
 
@@ -57,6 +58,11 @@ class _RobotState:
         self.scalars = np.stack([rod.scalars for rod in rods], axis=1)
         self.residual = math.hypot(*(rod.residual for rod in rods))
         self.iterations = max(rod.iterations for rod in rods)
+
+    def take(self, outputs: list[np.ndarray]) -> None:
+        """Copy the results of `warm_step`."""
+        (self.unknowns[:], self.tangents[:], self.poses[:], self.loads[:], self.load_tangents[:],
+         self.scalars[:]) = outputs[:6]  # fmt: skip
 
     def rods(self) -> list[_RodState]:
         """Split into rods."""
@@ -99,6 +105,8 @@ class RodSolver:
         self._state: _RobotState | None = None
         self._force_units = robot.stiffnesses / robot.lengths**2
         self._moment_units = robot.stiffnesses / robot.lengths
+        per_metre = self._force_units / robot.lengths
+        self._tangent_units = np.stack([per_metre, per_metre, self._force_units], axis=1).ravel()
 
     def start(self, p: np.ndarray, q: np.ndarray, nodes: np.ndarray | None = None) -> None:
         """Solve at (p, q) from a guess of the nodes, shape (n, 4, any N), or cold (None).
@@ -137,17 +145,17 @@ class RodSolver:
             Neither Newton's method nor continuation got there.
         """
         state = self._started()
-        for warm in self._warm:
+        # Where rough derivatives will do, one Newton iteration usually does; else the first would be wasted.
+        for warm in self._warm if derivatives >= _ROUGH else self._warm[1:]:
             warm.inputs[0][:] = p
             warm.inputs[1][:] = q
             warm.inputs[2][:] = state.unknowns
             warm.inputs[3][:] = state.tangents
             warm.inputs[4][:] = state.poses
             warm()
-            residual, rough, change, conjugate_points = warm.outputs[6]
+            residual, rough, change, conjugate_points = warm.outputs[6].tolist()
             if residual <= TOLERANCE and rough <= derivatives and change <= _BRANCH_CHANGE and not conjugate_points:
-                (state.unknowns[:], state.tangents[:], state.poses[:], state.loads[:], state.load_tangents[:],
-                 state.scalars[:]) = warm.outputs[:6]  # fmt: skip
+                state.take(warm.outputs)
                 state.residual, state.iterations = residual, 1 if warm is self._warm[0] else 2
                 return
         rods, poses = state.rods(), self._poses(p, q)
@@ -175,9 +183,9 @@ class RodSolver:
 
     def jacobians(self) -> tuple[np.ndarray, np.ndarray]:
         """K (2, 2) [N/m] and G (2, n) [N/rad] at the last pose, by implicit differentiation."""
-        moves = self._started().load_tangents[:2] * np.repeat(self._force_units, 3)
-        k = moves.reshape(2, -1, 3)[:, :, :2] / self.robot.lengths[:, None]
-        return k.sum(axis=1), moves[:, 2::3]
+        moves = self._started().load_tangents[:2] * self._tangent_units
+        k = np.stack([moves[:, 0::3].sum(axis=1), moves[:, 1::3].sum(axis=1)], axis=1)
+        return k, moves[:, 2::3]
 
     def equilibrium(self, p: np.ndarray, q: np.ndarray) -> Equilibrium:
         """Everything about the last pose, which was solved at (p, q)."""

@@ -1,0 +1,164 @@
+"""Command line: track a scene, solve a pose, time the loop."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+from .control.tuning import load_tuning
+from .errors import PCRError, SimulationError
+from .loop.controllers import make_controller
+from .loop.run import Run
+from .loop.scene import load_scene
+from .loop.simulate import simulate
+from .loop.timing import time_scene
+from .plant.dynamics import Plant
+from .plant.free_tip import forward_statics, inverse_statics
+from .plant.robot import load_robot
+from .plant.statics import METHODS, solve_statics
+from .report.plots import animate_run, plot_equilibrium, plot_run
+from .report.tables import equilibrium_record, equilibrium_table, summary_table, times_table
+
+_EXAMPLES = """\
+examples:
+  pcr-mpc track models/scenes/lemniscate.toml            closed loop, pictures and a table
+  pcr-mpc track models/scenes/limited.toml --json        the same figures for a machine
+  pcr-mpc statics models/planar_pair.toml --p 0 0.25 --mode LR     motor angles that hold the tip there
+  pcr-mpc statics models/rfrfr.toml --q 120 60 --degrees           where the free tip comes to rest
+  pcr-mpc timing models/scenes/lemniscate.toml           step times against the real-time budgets
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; return the exit status."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        status: int = options.run(options)
+        return status
+    except (PCRError, ValueError, OSError) as error:
+        if options.traceback:
+            traceback.print_exc()
+        print(f"pcr-mpc: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("pcr-mpc: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="pcr-mpc",
+        description="Model-predictive control of planar parallel continuum robots.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, run: Any, text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(run=run)
+        sub.add_argument("--json", action="store_true", help="print one JSON object on stdout instead of tables")
+        sub.add_argument("--traceback", action="store_true", help="show the traceback of a failure")
+        return sub
+
+    track = command("track", _track, "Run a scene in closed loop; write its record, a picture and an animation.")
+    track.add_argument("scene", type=Path, help="scene file, such as models/scenes/lemniscate.toml")
+    track.add_argument("--controller", type=Path, help="controller tuning instead of the scene's own")
+    track.add_argument("--method", choices=METHODS, help="statics of the plant instead of the scene's own")
+    track.add_argument("--seed", type=int, default=0, help="of the measurement noise (default 0)")
+    track.add_argument("--out", type=Path, help="folder for the results (default results/NAME)")
+    track.add_argument("--no-pictures", action="store_true", help="write the record only")
+
+    statics = command(
+        "statics", _statics, "Solve a pose: give --p and --q, or one of them to find the other in balance with --force."
+    )
+    statics.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
+    statics.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), help="tip position [m]")
+    statics.add_argument("--q", type=float, nargs="+", metavar="A", help="motor angles [rad]")
+    statics.add_argument("--degrees", action="store_true", help="motor angles are given in degrees")
+    statics.add_argument("--force", type=float, nargs=2, default=(0.0, 0.0), metavar=("FX", "FY"),
+                         help="external force on the tip [N], where p or q is to be found (default 0 0)")  # fmt: skip
+    statics.add_argument("--mode", help="working mode to look for, a letter L or R per rod, such as LR")
+    statics.add_argument("--method", choices=METHODS, default="closed_form", help="where both p and q are given")
+    statics.add_argument("--picture", type=Path, metavar="FILE", help="draw the pose into FILE")
+
+    timing = command("timing", _timing, "Time plant steps of every method and the control step against their budgets.")
+    timing.add_argument("scene", type=Path, help="scene file")
+    timing.add_argument("--steps", type=int, default=2000, help="plant steps per method (default 2000)")
+    return parser
+
+
+def _track(options: argparse.Namespace) -> int:
+    scene = load_scene(options.scene)
+    tuning = load_tuning(options.controller) if options.controller else None
+    plant = scene.make_plant()
+    if options.method:
+        settings = scene.plant
+        plant = Plant(scene.robot, method=options.method, segments=settings.segments, steps=settings.steps,
+                      scheme=settings.scheme, integrator=settings.integrator, dt=settings.dt)  # fmt: skip
+    folder = options.out or Path("results") / scene.name
+    failure: SimulationError | None = None
+    try:
+        run = simulate(scene, plant, make_controller(scene, tuning), options.seed, progress=True)
+    except SimulationError as error:
+        failure, run = error, error.run
+    files = run.save(folder)
+    summary = {**run.summary(), "files": files}
+    if not options.no_pictures:
+        files |= _pictures(run, folder)
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    print(json.dumps(summary) if options.json else f"\n{summary_table(summary)}\n\nwritten to {folder}")
+    if failure is not None:
+        raise failure
+    return 0
+
+
+def _pictures(run: Run, folder: Path) -> dict[str, str]:
+    picture, animation = folder / "track.png", folder / "track.gif"
+    plot_run(run, picture)
+    animate_run(run, animation, progress=True)
+    return {"track.png": str(picture), "track.gif": str(animation)}
+
+
+def _statics(options: argparse.Namespace) -> int:
+    robot = load_robot(options.robot)
+    q = options.q
+    if q is not None and options.degrees:
+        q = [math.radians(angle) for angle in q]
+    if options.p is not None and q is not None:
+        eq = solve_statics(robot, options.p, q, method=options.method)
+    elif options.p is not None:
+        eq = inverse_statics(robot, options.p, options.force, mode=options.mode)
+    elif q is not None:
+        eq = forward_statics(robot, q, options.force)
+    else:
+        raise ValueError("give --p, --q or both")
+    print(json.dumps(equilibrium_record(eq)) if options.json else equilibrium_table(eq))
+    if options.picture:
+        plot_equilibrium(eq, options.picture)
+    return 0
+
+
+def _timing(options: argparse.Namespace) -> int:
+    scene = load_scene(options.scene)
+    if options.steps < 1:
+        raise ValueError(f"--steps is {options.steps}, expected at least 1")
+    result = time_scene(scene, options.steps, progress=True)
+    if options.json:
+        print(json.dumps(result))
+        return 0
+    budgets = {"plant step": 1e6 * scene.plant.dt, "control step": 1e6 * scene.period}
+    rows = [(f"{c['name']} ({c['method']})", c, budgets.get(c["name"])) for c in result["components"]]
+    print(f"\n{scene.name}\n\n{times_table(rows)}\n")
+    print(", ".join(f"{name} {value}" for name, value in {**result["machine"], **result["versions"]}.items()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""How long the parts of the loop take, each on its own and back to back."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from dataclasses import replace
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ..plant.dynamics import Plant
+from ..plant.statics import METHODS
+from .controllers import make_controller
+from .run import percentiles
+from .scene import Scene
+from .simulate import simulate
+
+_WARM_UP = 20
+# One SciPy solve takes milliseconds: fewer of them say as much.
+_SLOW = {"single_shooting": 0.1}
+
+
+def time_scene(scene: Scene, steps: int = 2000, *, progress: bool = False) -> dict[str, Any]:
+    """Measure plant steps of every statics method and the control step of a scene.
+
+    Plant steps use velocity Verlet at 1 ms (one force evaluation each) with the scene's discretisation, driven
+    by the inputs of a closed-loop run. Control steps are replayed on the states of that run: back to back, as on
+    a computer that does nothing else, and as they were between the plant's steps.
+
+    Returns
+    -------
+    dict
+        ``components``: list of {name, method, p50, p95, p99, max, n} in us; ``machine``; ``versions``.
+    """
+    scene = replace(scene, duration=max(scene.duration, 20 * scene.period))
+    controller = make_controller(scene)
+    run = simulate(scene, scene.make_plant(), controller, progress=progress)
+    pose = scene.start()
+    components = []
+    for method in METHODS:
+        n = max(_WARM_UP + 10, int(steps * _SLOW.get(method, 1.0)))
+        plant = Plant(
+            scene.robot, method=method, segments=scene.plant.segments, steps=scene.plant.steps,
+            scheme=scene.plant.scheme, integrator="velocity_verlet", dt=1e-3,
+        )  # fmt: skip
+        plant.reset(run.x[0], pose)
+        components.append(_component("plant step", method, _plant_times(plant, scene, run, n, progress)))
+    if scene.trajectory is not None:
+        controller.start(pose)
+        states = run.x[:: scene.steps_per_period]
+        parts = np.empty((len(run.u), 4))
+        for k in range(len(run.u)):
+            began = time.perf_counter()
+            decision = controller.step(k, states[k])
+            parts[k, 0] = time.perf_counter() - began
+            assert decision.plan is not None
+            parts[k, 1:] = decision.linearise_time, decision.plan.update_time, decision.plan.solve_time
+        model = scene.tuning.model.method if scene.tuning else ""
+        for name, values in zip(("control step", "linearise", "QP update", "QP solve"), parts.T, strict=True):
+            components.append(_component(name, model, values))
+        components.append(_component("control step between plant steps", model, run.control_time[:, 0]))
+    return {"scene": scene.name, "components": components, "machine": machine(), "versions": versions()}
+
+
+def _plant_times(plant: Plant, scene: Scene, run: Any, n: int, progress: bool) -> np.ndarray:
+    """Times of n plant steps; when the run's inputs are used up, it starts again from the beginning."""
+    per = round(scene.period / plant.dt)
+    times = np.empty(n)
+    lap = len(run.u) * per
+    x = run.x[0]
+    pose = scene.start()
+    for k in tqdm(range(n), desc=f"plant, {plant.method}", unit="step", disable=not progress):
+        if k % lap == 0:
+            x = run.x[0]
+            plant.reset(x, pose)
+        u = run.u[k % lap // per]
+        began = time.perf_counter()
+        x = plant.step(x, u, scene.force)
+        times[k] = time.perf_counter() - began
+    return times
+
+
+def _component(name: str, method: str, seconds: np.ndarray) -> dict[str, Any]:
+    kept = seconds[_WARM_UP:]
+    return {"name": name, "method": method, **percentiles(1e6 * kept), "n": len(kept)}
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    return {
+        "platform": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what does the arithmetic."""
+    return {"python": platform.python_version(), **{name: version(name) for name in ("casadi", "numpy", "scipy", "osqp")}}

@@ -1,0 +1,162 @@
+"""Pictures of a run and of an equilibrium."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from tqdm import tqdm
+
+from ..loop.run import Run
+from ..plant.dynamics import Plant
+from ..plant.equilibrium import Equilibrium
+from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt
+
+_FRAMES_PER_SECOND = 20
+_LONGEST_ANIMATION = 4.0  # s of the run shown
+
+
+def draw_robot(axes: Any, eq: Equilibrium, alpha: float = 1.0) -> None:
+    """Draw rods, motors and the joint."""
+    for i, line in enumerate(eq.shape(60)):
+        axes.plot(*line.T, color=RODS[i % len(RODS)], lw=2.2, alpha=alpha, solid_capstyle="round", zorder=3)
+        axes.plot(*line[0], "s", color="black", ms=7, zorder=4)
+    axes.plot(*eq.p, "o", color="black", ms=7, alpha=alpha, zorder=5)
+
+
+def frame(axes: Any, shapes: np.ndarray, margin: float = 0.03) -> None:
+    """Set equal axes in metres around centrelines of shape (..., 2)."""
+    points = shapes.reshape(-1, 2)
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
+    axes.set_aspect("equal")
+
+
+def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
+    """Draw one equilibrium with its figures."""
+    figure, axes = plt.subplots(figsize=(6, 5))
+    draw_robot(axes, eq)
+    frame(axes, eq.shape(60))
+    verdict = "stable" if eq.stable else "unstable"
+    axes.set_title(
+        f"{eq.robot.name}: mode {eq.mode}, {verdict}\nF = ({eq.force[0]:.3g}, {eq.force[1]:.3g}) N, "
+        f"U = {eq.energy:.4g} J"
+    )
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
+    """Rods at some of the run's states, followed from one to the next."""
+    plant = Plant(run.scene.robot, method="closed_form", dt=run.scene.plant.dt)
+    plant.reset(run.x[0], run.scene.start())
+    wanted = set(indices.tolist())
+    # The branch is followed through every tenth state, not jumped to.
+    found = {}
+    for k in range(len(run.x)):
+        if k in wanted or k % 10 == 0:
+            eq = plant.equilibrium(run.x[k]) if k in wanted else None
+            if eq is None:
+                plant.force(run.x[k, :2], run.x[k, 4:])
+            else:
+                found[k] = eq
+    return [found[k] for k in indices.tolist()]
+
+
+def plot_run(run: Run, path: Path) -> None:
+    """Draw path, error, inputs with limits, and step times."""
+    figure, ((path_axes, error_axes), (input_axes, time_axes)) = plt.subplots(2, 2, figsize=(11, 8))
+    tracked = bool(np.isfinite(run.reference).all())
+    summary = run.summary()
+
+    shown = poses_along(run, np.unique(np.linspace(0, len(run.t) - 1, 4).astype(int)))
+    for eq in shown[1:]:
+        draw_robot(path_axes, eq, alpha=0.25)
+    draw_robot(path_axes, shown[0])
+    if tracked:
+        path_axes.plot(*run.reference.T, color=GREY, lw=4, alpha=0.5, label="reference", zorder=6)
+    path_axes.plot(*run.x[:, :2].T, color=RED, lw=1.2, label="tip", zorder=7)
+    frame(path_axes, np.concatenate([eq.shape(60) for eq in shown]))
+    path_axes.legend(loc="lower center", ncols=2)
+    path_axes.set_title(f"{run.scene.name}: robot and path of the tip")
+
+    if tracked:
+        error_axes.semilogy(run.t, np.maximum(1e3 * run.error, 1e-7), color=BLUE, lw=1.0)
+        late = summary["rms_after_1s_mm"]
+        if late is not None:
+            error_axes.axhline(late, color=ORANGE, ls="--", label=f"RMS after 1 s: {late:.2g} mm")
+            error_axes.legend(loc="best")
+        error_axes.set(ylabel="distance from the reference [mm]", title="Tracking error")
+    else:
+        for axis, (name, colour) in enumerate((("x", BLUE), ("y", ORANGE))):
+            error_axes.plot(run.t, 1e3 * (run.x[:, axis] - run.x[0, axis]), color=colour, label=name)
+        error_axes.set(ylabel="tip displacement [mm]", title="Free motion")
+        error_axes.legend(loc="best")
+    error_axes.set_xlabel("t [s]")
+
+    periods = run.scene.period * np.arange(len(run.u))
+    for i, rates in enumerate(run.u.T):
+        input_axes.step(periods, rates, where="post", color=RODS[i % len(RODS)], lw=1.2, label=f"motor {i + 1}")
+    limit = run.scene.robot.rate_limit
+    for sign in (-1, 1):
+        input_axes.axhline(sign * limit, color=RED, ls=":", label="limit" if sign > 0 else None)
+    input_axes.set(xlabel="t [s]", ylabel="motor rate [rad/s]", title="Inputs", ylim=(-1.35 * limit, 1.35 * limit))
+    input_axes.legend(loc="upper center", ncols=4)
+
+    plot_times(
+        time_axes,
+        {"plant step": (1e6 * run.plant_time, BLUE), "control step": (1e6 * run.control_time[:, 0], GREEN)},
+        {"plant step": (summary["plant_budget_us"], BLUE), "control period": (summary["control_budget_us"], PURPLE)},
+    )
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def plot_times(axes: Any, samples: dict[str, tuple[np.ndarray, str]], budgets: dict[str, tuple[float, str]]) -> None:
+    """Histogram of step times on a logarithmic axis, with budgets as lines."""
+    shown = {name: pair for name, pair in samples.items() if len(pair[0]) and pair[0].max() > 0}
+    bins = np.geomspace(5, 2e4, 90)
+    for name, (values, colour) in shown.items():
+        axes.hist(values, bins=bins, weights=np.full(len(values), 100 / len(values)), color=colour, alpha=0.6,
+                  label=f"{name}, median {np.median(values):.0f} us")  # fmt: skip
+    for name, (budget, colour) in budgets.items():
+        axes.axvline(budget, color=colour, ls="--", label=f"budget of the {name}")
+    axes.set(xscale="log", xlabel="wall time [us]", ylabel="share of steps [%]", title="Step times")
+    axes.legend(loc="upper right", fontsize=8)
+
+
+def animate_run(run: Run, path: Path, progress: bool = False) -> None:
+    """Write a GIF of the robot moving."""
+    every = round(1.0 / _FRAMES_PER_SECOND / run.scene.plant.dt)
+    last = min(len(run.t), int(_LONGEST_ANIMATION / run.scene.plant.dt))
+    indices = np.arange(0, last, every)
+    poses = poses_along(run, indices)
+    shapes = np.stack([eq.shape(40) for eq in poses])
+    figure, axes = plt.subplots(figsize=(5, 4.2), dpi=80)
+    frame(axes, shapes)
+    if np.isfinite(run.reference).all():
+        axes.plot(*run.reference[:last].T, color=GREY, lw=4, alpha=0.4)
+    rods = [axes.plot([], [], color=RODS[i % len(RODS)], lw=3)[0] for i in range(shapes.shape[1])]
+    axes.plot(*run.scene.robot.bases.T, "s", color="black", ms=8)
+    (trace,) = axes.plot([], [], color=RED, lw=1.2)
+    (tip,) = axes.plot([], [], "o", color="black", ms=8)
+    clock = axes.text(0.02, 0.97, "", transform=axes.transAxes, va="top")
+    figure.tight_layout()
+    bar = tqdm(total=len(indices), desc="animation", unit="frame", disable=not progress)
+
+    def show(i: int) -> list[Any]:
+        for line, shape in zip(rods, shapes[i], strict=True):
+            line.set_data(*shape.T)
+        trace.set_data(*run.x[: indices[i] + 1, :2].T)
+        tip.set_data([run.x[indices[i], 0]], [run.x[indices[i], 1]])
+        clock.set_text(f"t = {run.t[indices[i]]:.2f} s")
+        bar.update()
+        return [*rods, trace, tip, clock]
+
+    animation = FuncAnimation(figure, show, frames=len(indices), init_func=lambda: [], blit=False)
+    animation.save(path, writer=PillowWriter(fps=_FRAMES_PER_SECOND))
+    bar.close()
+    plt.close(figure)

@@ -1,0 +1,103 @@
+"""Tables for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ..plant.equilibrium import Equilibrium
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Align columns: the first to the left, the others to the right."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = [[cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
+             for row in [header, *rows]]  # fmt: skip
+    lines.insert(1, ["-" * w for w in widths])
+    return "\n".join("  ".join(line).rstrip() for line in lines)
+
+
+def summary_table(summary: dict[str, Any]) -> str:
+    """Figures of a run."""
+    lines = [
+        f"scene       {summary['scene']} ({summary['duration_s']:g} s)",
+        f"controller  {summary['controller']}",
+        f"plant       {summary['plant']}",
+        "",
+    ]
+    tracking = [
+        ("RMS", "rms_mm"), ("RMS after 1 s", "rms_after_1s_mm"), ("maximum", "max_mm"), ("at the end", "final_error_mm"),
+    ]  # fmt: skip
+    if summary["rms_mm"] is not None:
+        rows = [(name, "-" if summary[key] is None else f"{summary[key]:.4f}") for name, key in tracking]
+        lines += [table(("tracking error", "mm"), rows), ""]
+    times = [("plant step", summary["plant_step_us"], summary["plant_budget_us"])]
+    if summary["control_step_us"]["p50"] is not None:
+        times.append(("control step", summary["control_step_us"], summary["control_budget_us"]))
+        times += [(f"  {name}", values, None) for name, values in summary["control_parts_us"].items()]
+    lines += [times_table(times), ""]
+    iterations = summary["qp_iterations"]
+    lines += [
+        f"QP iterations     p50 {iterations['p50']}, max {iterations['max']}",
+        f"limit violations  {summary['limit_violations']}",
+        f"fall-backs        {summary['fallbacks']}",
+        f"failures          {summary['failures']}",
+    ]
+    return "\n".join(lines)
+
+
+def times_table(rows: Sequence[tuple[str, dict[str, Any], float | None]]) -> str:
+    """Percentiles of wall times in us against budgets."""
+    cells = [
+        (name, *(_us(values[key]) for key in ("p50", "p95", "p99", "max")), _us(budget)) for name, values, budget in rows
+    ]
+    return table(("wall time [us]", "p50", "p95", "p99", "max", "budget"), cells)
+
+
+def _us(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}" if value < 100 else f"{value:.0f}"
+
+
+def equilibrium_record(eq: Equilibrium) -> dict[str, Any]:
+    """Fields of an equilibrium, ready for JSON."""
+    return {
+        "robot": eq.robot.name,
+        "p": eq.p.tolist(),
+        "q": eq.q.tolist(),
+        "method": eq.method,
+        "mode": eq.mode,
+        "stable": eq.stable,
+        "unstable_rods": list(eq.unstable_rods),
+        "stiffness_eigenvalues": eq.stiffness_eigenvalues.tolist(),
+        "force": eq.force.tolist(),
+        "dforce_dp": eq.dforce_dp.tolist(),
+        "dforce_dq": eq.dforce_dq.tolist(),
+        "motor_torque": eq.motor_torque.tolist(),
+        "energy": eq.energy,
+        "rod_forces": eq.rod_forces.tolist(),
+        "residual_norm": eq.residual_norm,
+        "iterations": eq.iterations,
+        "drift": eq.drift,
+        "converged": eq.converged,
+    }
+
+
+def equilibrium_table(eq: Equilibrium) -> str:
+    """Figures of an equilibrium."""
+
+    def vector(values: Any) -> str:
+        return "(" + ", ".join(f"{v:.6g}" for v in values) + ")"
+
+    rows = [
+        ("tip p [m]", vector(eq.p)),
+        ("motor angles q [rad]", vector(eq.q)),
+        ("working mode", eq.mode),
+        ("verdict", "stable" if eq.stable else f"UNSTABLE (rods {list(eq.unstable_rods)})"),
+        ("force F = dU/dp [N]", vector(eq.force)),
+        ("motor torque dU/dq [N m]", vector(eq.motor_torque)),
+        ("eigenvalues of K [N/m]", vector(eq.stiffness_eigenvalues)),
+        ("energy U [J]", f"{eq.energy:.8g}"),
+        ("method", f"{eq.method}, {eq.iterations} iterations, residual {eq.residual_norm:.1e}, drift {eq.drift:.1e}"),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name.ljust(width)}  {value}" for name, value in rows)
