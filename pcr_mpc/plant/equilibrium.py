@@ -48,7 +48,7 @@ class Equilibrium:
     iterations : int
         Newton iterations of the slowest rod.
     drift : float
-        Largest change along a rod of m^2/2 + n . t over its size: the discretisation's own error estimate.
+        Change of the invariant m^2/2 + n . t along the rods, over its size: the discretisation's own error estimate.
     unstable_rods : tuple of int
         Rods with a conjugate point: not stable even with the tip held.
     """

@@ -113,8 +113,9 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     casadi.Function
         (p (2), q (n), unknowns (u, n), tangents (u, 3n), poses (3, n)) of the last pose ->
         unknowns, tangents, poses, loads (3, n), load_tangents (3, 3n), scalars (5, n) of the new one;
-        verdict (4) = [largest residual, largest residual where the derivatives were taken, largest change of an
-        unknown of the branch beyond the prediction, number of conjugate points].
+        verdict (5) = [largest residual, largest residual where the derivatives were taken, largest change of an
+        unknown of the branch beyond the prediction, number of conjugate points, drift of the invariant];
+        force (2) [N]; K (2, 2) [N/m]; G (2, n) [N/rad].
     """
     n, width = robot.n_rods, method.newton.size1_in(0)
     p, q = ca.MX.sym("p", 2), ca.MX.sym("q", n)
@@ -123,6 +124,7 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     branch = list(range(width))[method.branch]
     columns: dict[str, list[Any]] = {name: [] for name in ("u", "t", "pose", "loads", "load_t", "scalars")}
     residuals, roughest, changes = [], [], []
+    force, k, g = ca.MX(2, 1), ca.MX(2, 2), []
     for i, rod in enumerate(robot.rods):
         pose = ca.vertcat((p - ca.DM(rod.base)) / rod.length, q[i])
         start = tangents[:, 3 * i : 3 * i + 3]
@@ -136,10 +138,15 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
         residuals.append(residual)
         roughest.append(scalars[0])
         changes.append(ca.norm_inf((u - predicted)[branch]))
+        unit = rod.bending_stiffness / rod.length**2
+        force += unit * loads[:2]
+        k += unit / rod.length * load_tangent[:2, :2]
+        g.append(unit * load_tangent[:2, 2])
     conjugate_points = sum(scalars[3] for scalars in columns["scalars"])
     # Sums, not maxima, of what may be NaN: fmax would drop it.
-    verdict = ca.vertcat(sum(residuals), sum(roughest), sum(changes), conjugate_points)
-    results = [*(ca.horzcat(*blocks) for blocks in columns.values()), verdict]
+    drift = sum(ca.fabs(scalars[4]) for scalars in columns["scalars"])
+    verdict = ca.vertcat(sum(residuals), sum(roughest), sum(changes), conjugate_points, drift)
+    results = [*(ca.horzcat(*blocks) for blocks in columns.values()), verdict, force, k, ca.horzcat(*g)]
     function = ca.Function("warm_step", [p, q, unknowns, tangents, poses], results)
     small = method.newton.n_instructions() <= _INLINED_INSTRUCTIONS
     return function.expand("warm_step", {"cse": True}) if small else function

@@ -49,7 +49,7 @@ class _RodState:
 class _RobotState:
     """All rods as columns, the form in which the graph of a warm step takes and gives them."""
 
-    def __init__(self, rods: list[_RodState]) -> None:
+    def __init__(self, robot: Robot, rods: list[_RodState]) -> None:
         self.unknowns = np.stack([rod.unknowns for rod in rods], axis=1)
         self.tangents = np.concatenate([rod.tangent for rod in rods], axis=1)
         self.poses = np.stack([rod.pose for rod in rods], axis=1)
@@ -58,11 +58,22 @@ class _RobotState:
         self.scalars = np.stack([rod.scalars for rod in rods], axis=1)
         self.residual = math.hypot(*(rod.residual for rod in rods))
         self.iterations = max(rod.iterations for rod in rods)
+        self.drift = float(np.abs(self.scalars[4]).sum())
+        self.unstable_rods = tuple(i for i, count in enumerate(self.scalars[3].tolist()) if count)
+        units = robot.stiffnesses / robot.lengths**2
+        moves = self.load_tangents[:2].reshape(2, -1, 3)
+        self.force = self.loads[:2] @ units
+        self.k = np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths)
+        self.g = moves[:, :, 2] * units
 
-    def take(self, outputs: list[np.ndarray]) -> None:
-        """Copy the results of `warm_step`."""
+    def take(self, outputs: list[np.ndarray], iterations: int) -> None:
+        """Copy the results of `warm_step`, which found no conjugate point."""
         (self.unknowns[:], self.tangents[:], self.poses[:], self.loads[:], self.load_tangents[:],
          self.scalars[:]) = outputs[:6]  # fmt: skip
+        self.residual, _, _, _, self.drift = outputs[6].tolist()
+        self.force, self.k, self.g = (output.copy() for output in outputs[7:])
+        self.iterations = iterations
+        self.unstable_rods = ()
 
     def rods(self) -> list[_RodState]:
         """Split into rods."""
@@ -105,8 +116,6 @@ class RodSolver:
         self._state: _RobotState | None = None
         self._force_units = robot.stiffnesses / robot.lengths**2
         self._moment_units = robot.stiffnesses / robot.lengths
-        per_metre = self._force_units / robot.lengths
-        self._tangent_units = np.stack([per_metre, per_metre, self._force_units], axis=1).ravel()
 
     def start(self, p: np.ndarray, q: np.ndarray, nodes: np.ndarray | None = None) -> None:
         """Solve at (p, q) from a guess of the nodes, shape (n, 4, any N), or cold (None).
@@ -122,7 +131,7 @@ class RodSolver:
                 ]
             else:
                 rods = [self._cold(i, pose) for i, pose in enumerate(poses)]
-            self._state = _RobotState(rods)
+            self._state = _RobotState(self.robot, rods)
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
 
@@ -153,21 +162,20 @@ class RodSolver:
             warm.inputs[3][:] = state.tangents
             warm.inputs[4][:] = state.poses
             warm()
-            residual, rough, change, conjugate_points = warm.outputs[6].tolist()
+            residual, rough, change, conjugate_points, _ = warm.outputs[6].tolist()
             if residual <= TOLERANCE and rough <= derivatives and change <= _BRANCH_CHANGE and not conjugate_points:
-                state.take(warm.outputs)
-                state.residual, state.iterations = residual, 1 if warm is self._warm[0] else 2
+                state.take(warm.outputs, 1 if warm is self._warm[0] else 2)
                 return
         rods, poses = state.rods(), self._poses(p, q)
         try:
             rods = [self._follow(i, rods[i], pose, derivatives, continuation) for i, pose in enumerate(poses)]
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
-        self._state = _RobotState(rods)
+        self._state = _RobotState(self.robot, rods)
 
     def force(self) -> np.ndarray:
         """F = sum n_i = dU/dp at the last pose, shape (2,) [N]."""
-        return np.asarray(self._started().loads[:2] @ self._force_units)
+        return self._started().force
 
     def energy(self) -> float:
         """U at the last pose [J]."""
@@ -175,17 +183,16 @@ class RodSolver:
 
     def unstable_rods(self) -> tuple[int, ...]:
         """Rods with a conjugate point at the last pose."""
-        return tuple(i for i, count in enumerate(self._started().scalars[3].tolist()) if count)
+        return self._started().unstable_rods
 
     def drift(self) -> float:
-        """Largest change of the invariant m^2/2 + n . t along a rod, over its size."""
-        return max(map(abs, self._started().scalars[4].tolist()))
+        """Change of the invariant m^2/2 + n . t along the rods, over its size, added up."""
+        return self._started().drift
 
     def jacobians(self) -> tuple[np.ndarray, np.ndarray]:
         """K (2, 2) [N/m] and G (2, n) [N/rad] at the last pose, by implicit differentiation."""
-        moves = self._started().load_tangents[:2] * self._tangent_units
-        k = np.stack([moves[:, 0::3].sum(axis=1), moves[:, 1::3].sum(axis=1)], axis=1)
-        return k, moves[:, 2::3]
+        state = self._started()
+        return state.k, state.g
 
     def equilibrium(self, p: np.ndarray, q: np.ndarray) -> Equilibrium:
         """Everything about the last pose, which was solved at (p, q)."""
@@ -197,9 +204,9 @@ class RodSolver:
             p=np.array(p),
             q=np.array(q),
             method=self.method.name,
-            force=self.force(),
-            dforce_dp=k,
-            dforce_dq=g,
+            force=self.force().copy(),
+            dforce_dp=k.copy(),
+            dforce_dq=g.copy(),
             # The motor turns the rod's base against its internal moment.
             motor_torque=-self._moment_units * state.loads[2],
             dtorque_dq=-self._moment_units * state.load_tangents[2, 2::3],

@@ -78,7 +78,7 @@ def plot_run(run: Run, path: Path) -> None:
     if tracked:
         path_axes.plot(*run.reference.T, color=GREY, lw=4, alpha=0.5, label="reference", zorder=6)
     path_axes.plot(*run.x[:, :2].T, color=RED, lw=1.2, label="tip", zorder=7)
-    frame(path_axes, np.concatenate([eq.shape(60) for eq in shown]))
+    frame(path_axes, np.concatenate([run.x[:, :2], *(eq.shape(60).reshape(-1, 2) for eq in shown)]))
     path_axes.legend(loc="lower center", ncols=2)
     path_axes.set_title(f"{run.scene.name}: robot and path of the tip")
 
@@ -125,7 +125,8 @@ def plot_times(axes: Any, samples: dict[str, tuple[np.ndarray, str]], budgets: d
     for name, (budget, colour) in budgets.items():
         axes.axvline(budget, color=colour, ls="--", label=f"budget of the {name}")
     axes.set(xscale="log", xlabel="wall time [us]", ylabel="share of steps [%]", title="Step times")
-    axes.legend(loc="upper right", fontsize=8)
+    axes.set_ylim(0, 1.5 * axes.get_ylim()[1])
+    axes.legend(loc="upper left", fontsize=8)
 
 
 def animate_run(run: Run, path: Path, progress: bool = False) -> None:
@@ -136,7 +137,7 @@ def animate_run(run: Run, path: Path, progress: bool = False) -> None:
     poses = poses_along(run, indices)
     shapes = np.stack([eq.shape(40) for eq in poses])
     figure, axes = plt.subplots(figsize=(5, 4.2), dpi=80)
-    frame(axes, shapes)
+    frame(axes, np.concatenate([run.x[:last, :2], shapes.reshape(-1, 2)]))
     if np.isfinite(run.reference).all():
         axes.plot(*run.reference[:last].T, color=GREY, lw=4, alpha=0.4)
     rods = [axes.plot([], [], color=RODS[i % len(RODS)], lw=3)[0] for i in range(shapes.shape[1])]
