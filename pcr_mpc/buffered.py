@@ -33,9 +33,9 @@ class BufferedFunction:
         # The buffer object owns the work memory: losing it while `_trigger` lives is a segfault.
         self._buffer, self._trigger = function.buffer()
         for i, memory in enumerate(self._input_memory):
-            self._buffer.set_arg(i, memoryview(memory))
+            self._buffer.set_arg(i, memoryview(memory.data))
         for i, memory in enumerate(self._output_memory):
-            self._buffer.set_res(i, memoryview(memory))
+            self._buffer.set_res(i, memoryview(memory.data))
         self.inputs = [_view(m, function.size_in(i)) for i, m in enumerate(self._input_memory)]
         self.outputs = [_view(m, function.size_out(i)) for i, m in enumerate(self._output_memory)]
 

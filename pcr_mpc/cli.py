@@ -76,7 +76,9 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("--no-pictures", action="store_true", help="write the record only")
 
     statics = command(
-        "statics", _statics, "Solve a pose: give --p and --q, or one of them to find the other in balance with --force."
+        "statics",
+        _statics,
+        "Solve a pose: give --p and --q, or one of them to find the other in balance with --force.",
     )
     statics.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
     statics.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), help="tip position [m]")

@@ -78,7 +78,7 @@ class Table:
             raise self.fail(key, f"expected an integer >= {minimum}, found {value!r}")
         return value
 
-    def vector(self, key: str, size: int | None, default: Any = _REQUIRED) -> tuple[float, ...] | Any:
+    def vector(self, key: str, size: int | None, default: Any = _REQUIRED) -> Any:
         """Take a list of ``size`` finite numbers (any size if None)."""
         value = self._take(key, default)
         if value is default:

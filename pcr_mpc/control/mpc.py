@@ -155,7 +155,9 @@ class LinearMPC:
         )
         return self._last
 
-    def _solve(self, qp: QuadraticProgram, rates_only: QPSolver, complete: QPSolver, warm: np.ndarray | None) -> Solution:
+    def _solve(
+        self, qp: QuadraticProgram, rates_only: QPSolver, complete: QPSolver, warm: np.ndarray | None
+    ) -> Solution:
         """Solve with the rates' rows alone; where that breaks another row, with all of them.
 
         An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half.

@@ -119,7 +119,7 @@ def constraint_matrix(horizon: int, n: int, dt: float) -> sp.csc_matrix:
     rates = sp.identity(horizon * n)
     changes = sp.kron(sp.diags([1.0, -1.0], [0, -1], shape=(horizon, horizon)), each)
     angles = sp.kron(dt * np.tril(np.ones((horizon, horizon))), each)
-    matrix = sp.vstack([rates, changes, angles]).tocsc()
+    matrix = sp.csc_matrix(sp.vstack([rates, changes, angles]))
     matrix.sort_indices()
     return matrix
 
@@ -143,12 +143,20 @@ def _condensing(horizon: int, n: int, single: bool, velocity: bool, angle: bool,
     count = 1 if single else horizon
     a_all, b_all, c_all = (
         ca.SX.sym(name, *shape)
-        for name, shape in (("A", (n_states, count * n_states)), ("B", (n_states, count * n)), ("c", (count * n_states, 1)))
+        for name, shape in (
+            ("A", (n_states, count * n_states)),
+            ("B", (n_states, count * n)),
+            ("c", (count * n_states, 1)),
+        )
     )
     x = ca.SX.sym("x", n_states)
     states, inputs = ca.SX.sym("states", n_states, horizon), ca.SX.sym("inputs", n, horizon)
     previous, weights = ca.SX.sym("previous", n), ca.SX.sym("weights", 4)
-    terminal, bounds, dt = ca.SX.sym("terminal", n_states, n_states), ca.SX.sym("bounds", n, 4), ca.SX.sym("dt")
+    terminal, bounds, dt = (
+        ca.SX.sym("terminal", n_states, n_states),
+        ca.SX.sym("bounds", n, 4),
+        ca.SX.sym("dt"),
+    )
 
     def part(block: Any, k: int, width: int) -> Any:
         k = 0 if single else k
@@ -196,14 +204,24 @@ def _condensing(horizon: int, n: int, single: bool, velocity: bool, angle: bool,
             elif j < horizon - 1:
                 blocks[i][j] = blocks[i + 1][j + 1] + response(horizon - 1, i).T @ weighted[horizon - 1]
             ends[i, j] = blocks[i][j] + response(horizon, i).T @ last
-    hessian = ca.vertcat(*(ca.horzcat(*(ends.get((i, j), ca.SX(n, n)) for j in range(horizon))) for i in range(horizon)))
+    hessian = ca.vertcat(
+        *(ca.horzcat(*(ends.get((i, j), ca.SX(n, n)) for j in range(horizon))) for i in range(horizon))
+    )
     hessian += weights[3] * ca.SX.eye(horizon * n)
     upper_triangle = ca.vertcat(*(hessian[: j + 1, j] for j in range(horizon * n)))
 
     rate, change, lower, upper = (bounds[:, i] for i in range(4))
     first = ca.vertcat(previous, ca.SX(n * (horizon - 1), 1))
-    l_all = [-ca.repmat(rate, horizon, 1), first - ca.repmat(change, horizon, 1), ca.repmat(lower - x[4:], horizon, 1)]
-    u_all = [ca.repmat(rate, horizon, 1), first + ca.repmat(change, horizon, 1), ca.repmat(upper - x[4:], horizon, 1)]
+    l_all = [
+        -ca.repmat(rate, horizon, 1),
+        first - ca.repmat(change, horizon, 1),
+        ca.repmat(lower - x[4:], horizon, 1),
+    ]
+    u_all = [
+        ca.repmat(rate, horizon, 1),
+        first + ca.repmat(change, horizon, 1),
+        ca.repmat(upper - x[4:], horizon, 1),
+    ]
     function = ca.Function(
         "condense",
         [a_all, b_all, c_all, x, states, inputs, previous, weights, terminal, bounds, dt],

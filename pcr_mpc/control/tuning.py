@@ -85,22 +85,26 @@ def load_tuning(path: str | Path) -> Tuning:
     ModelError
         A key is missing, misspelt, of the wrong type or out of range.
     """
-    with read_toml(path) as file:
-        with file.table("weights") as weights, file.table("solver", {}) as solver, file.table("model", {}) as model:
-            return Tuning(
-                name=file.text("name"),
-                horizon=file.integer("horizon"),
-                position_weight=weights.number("position", above=0.0),
-                velocity_weight=weights.number("velocity", 0.0, minimum=0.0),
-                angle_weight=weights.number("angle", 0.0, minimum=0.0),
-                input_weight=weights.number("input", above=0.0),
-                tolerance=solver.number("tolerance", 1e-5, above=0.0),
-                max_iterations=solver.integer("max_iterations", 4000),
-                fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),
-                model=Model(
-                    method=model.text("method", Model.method),
-                    segments=model.integer("segments", Model.segments),
-                    steps=model.integer("steps", Model.steps),
-                    scheme=model.text("scheme", Model.scheme),
-                ),
-            )
+    with (
+        read_toml(path) as file,
+        file.table("weights") as weights,
+        file.table("solver", {}) as solver,
+        file.table("model", {}) as model,
+    ):
+        return Tuning(
+            name=file.text("name"),
+            horizon=file.integer("horizon"),
+            position_weight=weights.number("position", above=0.0),
+            velocity_weight=weights.number("velocity", 0.0, minimum=0.0),
+            angle_weight=weights.number("angle", 0.0, minimum=0.0),
+            input_weight=weights.number("input", above=0.0),
+            tolerance=solver.number("tolerance", 1e-5, above=0.0),
+            max_iterations=solver.integer("max_iterations", 4000),
+            fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),
+            model=Model(
+                method=model.text("method", Model.method),
+                segments=model.integer("segments", Model.segments),
+                steps=model.integer("steps", Model.steps),
+                scheme=model.text("scheme", Model.scheme),
+            ),
+        )

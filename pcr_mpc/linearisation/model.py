@@ -86,7 +86,8 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     function.inputs[3][:] = x
     function.inputs[4][:] = plant.robot.tip_mass, plant.robot.drag, dt
     function()
-    return LinearModel(*(output.copy() for output in function.outputs), dt)
+    a, b, c = (output.copy() for output in function.outputs)
+    return LinearModel(a, b, c, dt)
 
 
 @lru_cache(maxsize=32)
@@ -131,4 +132,6 @@ def _discretisation(n: int, thread: int) -> BufferedFunction:
     state = ca.vertcat(0, 0, dt * x[2], dt * x[3])
     moved = exponential @ state - scale * ca.mtimes(phi_1, force)
     c_vector = ca.vertcat(p + moved[:2], moved[2:] / dt, q) - a_matrix @ x
-    return BufferedFunction(ca.Function("discretise", [k, g, force, x, parameters], [a_matrix, b_matrix, c_vector], {"cse": True}))
+    return BufferedFunction(
+        ca.Function("discretise", [k, g, force, x, parameters], [a_matrix, b_matrix, c_vector], {"cse": True})
+    )

@@ -123,9 +123,7 @@ def motor_limits(robot: Robot, period: float) -> Limits:
     return Limits(robot.rate_limit, robot.acceleration_limit * period, lower.copy(), upper.copy())
 
 
-def feed_forward(
-    scene: Scene, robot: Robot, pose: Equilibrium, horizon: int
-) -> tuple[np.ndarray, np.ndarray]:
+def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     """Inverse dynamics of the reference at every period, and one horizon beyond the end.
 
     The motor angles are those at which the rods carry F = -m a - c v on the reference; the rates lead from

@@ -15,9 +15,7 @@ from .run import Run
 from .scene import Scene
 
 
-def simulate(
-    scene: Scene, plant: Plant, controller: Controller, seed: int = 0, *, progress: bool = False
-) -> Run:
+def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, *, progress: bool = False) -> Run:
     """Run a scene in closed loop.
 
     Parameters
@@ -94,7 +92,13 @@ def simulate(
                 control_time[k, 1:] = decision.linearise_time, plan.update_time, plan.solve_time
                 iterations[k] = plan.iterations
                 if plan.fallback:
-                    events.append({"t": k * scene.period, "kind": "fallback", "message": f"{plan.status}: {plan.fallback}"})
+                    events.append(
+                        {
+                            "t": k * scene.period,
+                            "kind": "fallback",
+                            "message": f"{plan.status}: {plan.fallback}",
+                        }
+                    )
             for _ in range(per):
                 began = time.perf_counter()
                 x = plant.step(x, decision.u, scene.force)

@@ -101,4 +101,7 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Versions of what does the arithmetic."""
-    return {"python": platform.python_version(), **{name: version(name) for name in ("casadi", "numpy", "scipy", "osqp")}}
+    return {
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("casadi", "numpy", "scipy", "osqp")},
+    }

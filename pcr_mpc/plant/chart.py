@@ -12,6 +12,7 @@ the sheet of stable shapes is tabulated once, and a tip position is looked up by
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -159,9 +160,7 @@ class _Chart:
 
 @lru_cache
 def _chart() -> _Chart:
-    log_tip_angle = np.concatenate(
-        [-np.geomspace(_MAX_LOAD, 2.5, 150), np.log(np.linspace(0.1, np.pi - 1e-3, 110))]
-    )
+    log_tip_angle = np.concatenate([-np.geomspace(_MAX_LOAD, 2.5, 150), np.log(np.linspace(0.1, np.pi - 1e-3, 110))])
     load, delta, sheet, determinant = _trajectories(log_tip_angle)
     # The determinant has no zero before the quarter period, where it may be all rounding.
     middle = np.argmax(load > _quarter_period(log_tip_angle)[:, None], axis=1)
@@ -246,7 +245,7 @@ def _pendulum_with_tangent(state: np.ndarray) -> np.ndarray:
     return np.array([rate, sin, cos, sin, d_rate, cos * d_delta, -sin * d_delta, cos * d_delta])
 
 
-def _rk4(f, state, h):  # type: ignore[no-untyped-def]
+def _rk4(f: Callable[[Any], Any], state: Any, h: Any) -> Any:
     k1 = f(state)
     k2 = f(state + h / 2 * k1)
     k3 = f(state + h / 2 * k2)

@@ -168,7 +168,7 @@ class Plant:
         self._at = at
 
     def _acceleration(self, p: np.ndarray, v: np.ndarray, q: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
-        return (f_ext - self.force(p, q) - self.robot.drag * v) / self.robot.tip_mass
+        return np.asarray((f_ext - self.force(p, q) - self.robot.drag * v) / self.robot.tip_mass)
 
 
 def _semi_implicit_euler(plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:

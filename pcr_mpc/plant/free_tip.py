@@ -23,9 +23,7 @@ _OFFSETS = np.linspace(-2.6, 2.6, 40)  # clamp angle minus chord angle, of a col
 _CANDIDATES = 24
 
 
-def forward_statics(
-    robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equilibrium | None = None
-) -> Equilibrium:
+def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equilibrium | None = None) -> Equilibrium:
     """Tip position at which the rods carry a given force: the free pose for given motors.
 
     Parameters
@@ -173,7 +171,7 @@ def _settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) 
             if np.linalg.norm(step) < 1e-7 * robot.lengths.min():
                 raise ConvergenceError(
                     f"the tip cannot settle near p = {p} m for q = {q} rad: force residual "
-                    f"{np.linalg.norm(residual):.3g} N after {iteration} iterations; pass a guess on the branch you want",
+                    f"{np.linalg.norm(residual):.3g} N after {iteration} iterations; pass a guess",
                     residual=float(np.linalg.norm(residual)),
                     iterations=iteration,
                     last=p,
@@ -194,9 +192,7 @@ def _reach(solver: RodSolver, guess: Equilibrium, p: np.ndarray, force: np.ndarr
     while done < 1.0:
         target = min(1.0, done + substep)
         try:
-            q = _turn(
-                solver, guess.p + target * (p - guess.p), q, guess.force + target * (force - guess.force)
-            )
+            q = _turn(solver, guess.p + target * (p - guess.p), q, guess.force + target * (force - guess.force))
         except ConvergenceError as error:
             substep /= 2
             if substep < 1e-2:

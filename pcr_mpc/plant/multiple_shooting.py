@@ -98,12 +98,12 @@ def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
     first = ca.DM([[1, 0, 0, 0]])
     base_loads = _solve3(t[0][:, 3:], r[0] @ first - t[0][:, :3] @ base)
     change = ca.vertcat(base, base_loads)
-    moves = [change[2:, :]]
+    blocks = [change[2:, :]]
     for j in range(n - 1):
         change = transition[j] @ change + gap[j] @ first
         change -= t[j + 1].T @ (t[j + 1] @ change - r[j + 1] @ first)
-        moves.append(change[2:, :])
-    moves = ca.vertcat(*moves)
+        blocks.append(change[2:, :])
+    moves = ca.vertcat(*blocks)
 
     energy = sum(end[6] for end in ends)
     drift = _invariant(ends[-1][2:6]) - _invariant(z[0])

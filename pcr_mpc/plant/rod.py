@@ -92,4 +92,4 @@ def sample_rod(nodes: np.ndarray, n_points: int) -> np.ndarray:
     piece = np.minimum((s * n_nodes).astype(int), n_nodes - 1)
     ends = _sampler(n_points)(nodes[:, piece], (s - piece / n_nodes)[None, :]).full()
     ends[:2] += starts[:, piece]
-    return ends[:6]
+    return np.asarray(ends[:6])

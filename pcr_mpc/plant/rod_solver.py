@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,20 +31,18 @@ class _NotConverged(Exception):
         self.rod, self.residual, self.iterations, self.unknowns = rod, residual, iterations, unknowns
 
 
+@dataclass(frozen=True, eq=False)
 class _RodState:
     """One solved rod: normalised pose, unknowns, and what the last linear solve gave."""
 
-    __slots__ = ("iterations", "load_tangent", "loads", "pose", "residual", "scalars", "tangent", "unknowns")
-
-    def __init__(self, pose, unknowns, tangent, loads, load_tangent, scalars, residual, iterations):  # type: ignore[no-untyped-def]
-        self.pose = pose  # (3,) tip relative to base / L, clamp angle
-        self.unknowns = unknowns
-        self.tangent = tangent  # d unknowns / d pose
-        self.loads = loads  # (3,) n_x, n_y, m at the base
-        self.load_tangent = load_tangent  # (3, 3) d loads / d pose
-        self.scalars = scalars  # (5,) residual, step length, energy, conjugate points, drift
-        self.residual = residual
-        self.iterations = iterations
+    pose: np.ndarray  # (3,) tip relative to base / L, clamp angle
+    unknowns: np.ndarray
+    tangent: np.ndarray  # d unknowns / d pose
+    loads: np.ndarray  # (3,) n_x, n_y, m at the base
+    load_tangent: np.ndarray  # (3, 3) d loads / d pose
+    scalars: np.ndarray  # (5,) residual, step length, energy, conjugate points, drift
+    residual: float
+    iterations: int
 
 
 class _RobotState:
@@ -62,9 +61,9 @@ class _RobotState:
         self.unstable_rods = tuple(i for i, count in enumerate(self.scalars[3].tolist()) if count)
         units = robot.stiffnesses / robot.lengths**2
         moves = self.load_tangents[:2].reshape(2, -1, 3)
-        self.force = self.loads[:2] @ units
-        self.k = np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths)
-        self.g = moves[:, :, 2] * units
+        self.force: np.ndarray = self.loads[:2] @ units
+        self.k: np.ndarray = np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths)
+        self.g: np.ndarray = moves[:, :, 2] * units
 
     def take(self, outputs: list[np.ndarray], iterations: int) -> None:
         """Copy the results of `warm_step`, which found no conjugate point."""
@@ -103,8 +102,8 @@ class RodSolver:
     Notes
     -----
     `move` climbs a ladder: tangent predictor and one or two Newton iterations, all rods in one graph; damped
-    Newton, rod by rod; continuation from the last pose in halved sub-steps; then `ConvergenceError`. It never falls back to a cold start, which could
-    land on another branch. A failed call leaves the last pose as it was.
+    Newton, rod by rod; continuation from the last pose in halved sub-steps; then `ConvergenceError`. It never
+    falls back to a cold start, which could land on another branch. A failed call leaves the last pose as it was.
     """
 
     def __init__(self, robot: Robot, method: RodMethod) -> None:
@@ -126,8 +125,7 @@ class RodSolver:
         try:
             if nodes is not None:
                 rods = [
-                    self._solve(i, pose, self.method.from_nodes(nodes[i]), TOLERANCE)
-                    for i, pose in enumerate(poses)
+                    self._solve(i, pose, self.method.from_nodes(nodes[i]), TOLERANCE) for i, pose in enumerate(poses)
                 ]
             else:
                 rods = [self._cold(i, pose) for i, pose in enumerate(poses)]
@@ -135,9 +133,7 @@ class RodSolver:
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
 
-    def move(
-        self, p: np.ndarray, q: np.ndarray, *, derivatives: float = TOLERANCE, continuation: bool = True
-    ) -> None:
+    def move(self, p: np.ndarray, q: np.ndarray, *, derivatives: float = TOLERANCE, continuation: bool = True) -> None:
         """Follow the branch from the last pose to (p, q).
 
         Parameters
@@ -231,9 +227,7 @@ class RodSolver:
             for rod, angle in zip(self.robot.rods, q, strict=True)
         ]
 
-    def _follow(
-        self, i: int, start: _RodState, pose: np.ndarray, derivatives: float, continuation: bool
-    ) -> _RodState:
+    def _follow(self, i: int, start: _RodState, pose: np.ndarray, derivatives: float, continuation: bool) -> _RodState:
         try:
             return self._predict(i, start, pose, derivatives)
         except _NotConverged as failure:
@@ -324,7 +318,14 @@ class RodSolver:
     ) -> _RodState:
         _, tangent, _, load_tangent, scalars = self._newton.outputs
         return _RodState(
-            pose, unknowns, tangent.copy(), loads.copy(), load_tangent.copy(), scalars.copy(), float(residual), iterations
+            pose,
+            unknowns,
+            tangent.copy(),
+            loads.copy(),
+            load_tangent.copy(),
+            scalars.copy(),
+            float(residual),
+            iterations,
         )
 
     def _error(self, failure: _NotConverged, p: np.ndarray, q: np.ndarray) -> ConvergenceError:

@@ -13,7 +13,7 @@ from ..buffered import BufferedFunction
 from ..errors import ConvergenceError
 from .chart import held_shapes
 from .equilibrium import Equilibrium
-from .multiple_shooting import rod_newton, robot_residual
+from .multiple_shooting import robot_residual, rod_newton
 from .robot import Robot
 from .rod import sample_rod
 

@@ -108,7 +108,10 @@ def plot_run(run: Run, path: Path) -> None:
     plot_times(
         time_axes,
         {"plant step": (1e6 * run.plant_time, BLUE), "control step": (1e6 * run.control_time[:, 0], GREEN)},
-        {"plant step": (summary["plant_budget_us"], BLUE), "control period": (summary["control_budget_us"], PURPLE)},
+        {
+            "plant step": (summary["plant_budget_us"], BLUE),
+            "control period": (summary["control_budget_us"], PURPLE),
+        },
     )
     figure.tight_layout()
     figure.savefig(path)

@@ -26,8 +26,11 @@ def summary_table(summary: dict[str, Any]) -> str:
         "",
     ]
     tracking = [
-        ("RMS", "rms_mm"), ("RMS after 1 s", "rms_after_1s_mm"), ("maximum", "max_mm"), ("at the end", "final_error_mm"),
-    ]  # fmt: skip
+        ("RMS", "rms_mm"),
+        ("RMS after 1 s", "rms_after_1s_mm"),
+        ("maximum", "max_mm"),
+        ("at the end", "final_error_mm"),
+    ]
     if summary["rms_mm"] is not None:
         rows = [(name, "-" if summary[key] is None else f"{summary[key]:.4f}") for name, key in tracking]
         lines += [table(("tracking error", "mm"), rows), ""]
@@ -49,7 +52,8 @@ def summary_table(summary: dict[str, Any]) -> str:
 def times_table(rows: Sequence[tuple[str, dict[str, Any], float | None]]) -> str:
     """Percentiles of wall times in us against budgets."""
     cells = [
-        (name, *(_us(values[key]) for key in ("p50", "p95", "p99", "max")), _us(budget)) for name, values, budget in rows
+        (name, *(_us(values[key]) for key in ("p50", "p95", "p99", "max")), _us(budget))
+        for name, values, budget in rows
     ]
     return table(("wall time [us]", "p50", "p95", "p99", "max", "budget"), cells)
 
@@ -97,7 +101,10 @@ def equilibrium_table(eq: Equilibrium) -> str:
         ("motor torque dU/dq [N m]", vector(eq.motor_torque)),
         ("eigenvalues of K [N/m]", vector(eq.stiffness_eigenvalues)),
         ("energy U [J]", f"{eq.energy:.8g}"),
-        ("method", f"{eq.method}, {eq.iterations} iterations, residual {eq.residual_norm:.1e}, drift {eq.drift:.1e}"),
+        (
+            "method",
+            f"{eq.method}, {eq.iterations} iterations, residual {eq.residual_norm:.1e}, drift {eq.drift:.1e}",
+        ),
     ]
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name.ljust(width)}  {value}" for name, value in rows)

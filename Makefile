@@ -1,0 +1,34 @@
+# Two commands do everything on a fresh clone: `make track` and `make test`.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: track test test-slow lint figures clean
+
+track: $(READY)  ## follow the figure of eight in closed loop; pictures and table in results/lemniscate
+	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml
+
+test: $(READY)  ## the default test run
+	$(BIN)/python -m pytest -q
+
+test-slow: $(READY)  ## the tests marked slow
+	$(BIN)/python -m pytest -q -m slow
+
+lint: $(READY)  ## style, types, layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
+	$(BIN)/python experiments/paper_figures.py --out docs
+	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
+	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $(READY)
+
+clean:
+	rm -rf .venv results
