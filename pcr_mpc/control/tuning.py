@@ -18,8 +18,8 @@ class Model:
 
     method: str = "closed_form"
     segments: int = 8
-    steps: int = 4
-    scheme: str = "rk4"
+    steps: int = 1
+    scheme: str = "rk8"
 
 
 @dataclass(frozen=True)

@@ -135,8 +135,8 @@ def load_scene(path: str | Path) -> Scene:
             plant = PlantSettings(
                 method=table.text("method", "closed_form", choices=METHODS),
                 segments=table.integer("segments", 8),
-                steps=table.integer("steps", 4),
-                scheme=table.text("scheme", "rk4", choices=tuple(SCHEMES)),
+                steps=table.integer("steps", 1),
+                scheme=table.text("scheme", "rk8", choices=tuple(SCHEMES)),
                 integrator=table.text("integrator", choices=tuple(INTEGRATORS)),
                 dt=table.number("dt", above=0.0),
             )

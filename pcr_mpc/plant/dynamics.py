@@ -50,8 +50,8 @@ class Plant:
         *,
         method: str = "closed_form",
         segments: int = 8,
-        steps: int = 4,
-        scheme: str = "rk4",
+        steps: int = 1,
+        scheme: str = "rk8",
         integrator: str = "semi_implicit_euler",
         dt: float = 1e-3,
     ) -> None:

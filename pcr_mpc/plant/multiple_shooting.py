@@ -145,7 +145,7 @@ def _solve3(m: Any, rhs: Any) -> Any:
     return adjugate @ rhs / _determinant3(m)
 
 
-def robot_residual(robot: Robot, segments: int = 8, steps: int = 4, scheme: str = "rk4") -> Any:
+def robot_residual(robot: Robot, segments: int = 8, steps: int = 1, scheme: str = "rk8") -> Any:
     """Weighted residual R(Y) of the whole robot, paper eq. (15)-(16), in physical units.
 
     This is the text of the paper; the solver above works on the same equations rod by rod.

@@ -34,8 +34,8 @@ class Shooting:
     """
 
     segments: int = 8
-    steps: int = 4
-    scheme: str = "rk4"
+    steps: int = 1
+    scheme: str = "rk8"
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ class SingleShooting:
         Runge-Kutta scheme.
     """
 
-    def __init__(self, robot: Robot, steps: int = 32, scheme: str = "rk4") -> None:
+    def __init__(self, robot: Robot, steps: int = 8, scheme: str = "rk8") -> None:
         self.robot = robot
         self._evaluate = BufferedFunction(_residual_and_jacobians(robot, steps, scheme))
         self._units = np.stack([robot.stiffnesses / robot.lengths**e for e in (2, 2, 1)], axis=1)

@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from experiments.finite_differences import error_curve
+from pcr_mpc import Plant, linearise, load_robot
+
+from .conftest import MODELS
+
+
+def state(pose, velocity=(0.05, -0.1)):
+    return np.concatenate([pose.p, velocity, pose.q])
+
+
+@pytest.mark.parametrize("method", ["closed_form", "multiple_shooting"])
+def test_jacobians_against_central_differences(pair, poses, method):
+    """The error falls with the square of the step, then rises with rounding; its floor is below 1e-7."""
+    for pose in poses[:2]:
+        steps, errors = error_curve(pair, pose, method)
+        assert errors.min() < 1e-7
+        falling = (steps <= 1e-2) & (steps >= 3e-4)
+        slope = np.polyfit(np.log(steps[falling]), np.log(errors[falling]), 1)[0]
+        assert slope == pytest.approx(2.0, abs=0.2)
+        assert errors[0] > 10 * errors.min()  # rounding
+
+
+@pytest.mark.parametrize("dt", [1e-3, 1e-2, 1e-1])
+def test_discretisation_is_exact(pair, poses, dt):
+    """Against SciPy's matrix exponential of the whole affine system."""
+    plant = Plant(pair)
+    for pose in poses:
+        x, f_ext = state(pose), np.array([0.3, -0.2])
+        plant.reset(x, pose)
+        model = linearise(plant, x, (0.0, 0.0), dt, f_ext)
+        eq = plant.equilibrium(x)
+        m, n = pair.tip_mass, 2
+        whole = np.zeros((4 + 2 * n + 1, 4 + 2 * n + 1))
+        whole[0:2, 2:4] = np.eye(2)
+        whole[2:4, 0:2] = -eq.dforce_dp / m
+        whole[2:4, 2:4] = -pair.drag / m * np.eye(2)
+        whole[2:4, 4:6] = -eq.dforce_dq / m
+        whole[4:6, 6:8] = np.eye(2)
+        whole[2:4, 8] = (f_ext - eq.force + eq.dforce_dp @ x[:2] + eq.dforce_dq @ x[4:]) / m
+        exact = expm(dt * whole)
+        assert model.A == pytest.approx(exact[:6, :6], rel=1e-8, abs=1e-8)
+        assert model.B == pytest.approx(exact[:6, 6:8], rel=1e-8, abs=1e-8)
+        assert model.c == pytest.approx(exact[:6, 8], rel=1e-8, abs=1e-8)
+
+
+def test_prediction_error_is_of_second_order(pair, centre):
+    """Halving the displacement from the point of linearisation quarters the error of one period."""
+    plant = Plant(pair, integrator="rk4", dt=1e-3)
+    x = state(centre, (0.0, 0.0))
+    plant.reset(x, centre)
+    model = linearise(plant, x, (0.0, 0.0), 0.02)
+    errors = []
+    for size in (0.02, 0.01, 0.005):
+        y = x + size * np.array([0.6, -0.8, 0.5, 0.5, 1.0, -0.5])
+        u = size * np.array([20.0, 10.0])
+        predicted = model(y, u)
+        plant.reset(y, centre)
+        for _ in range(20):
+            y = plant.step(y, u)
+        errors.append(np.linalg.norm(predicted - y))
+    rates = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert rates == pytest.approx([2.0, 2.0], abs=0.2)
+
+
+def test_state_space(pair, centre):
+    plant = Plant(pair)
+    x = state(centre)
+    plant.reset(x, centre)
+    model = linearise(plant, x, (0.0, 0.0), 0.01)
+    system = model.to_control()
+    assert system.dt == 0.01
+    assert system.A == pytest.approx(model.A)
+    assert system.C @ x == pytest.approx(x[:2])
+    # Two integrators of the motors, four damped poles of the stable pose.
+    poles = np.abs(system.poles())
+    assert np.sum(np.isclose(poles, 1.0)) == 2
+    assert np.sum(poles < 0.999) == 4
+
+
+def test_models_do_not_share_memory(pair, centre):
+    plant = Plant(pair)
+    x = state(centre)
+    plant.reset(x, centre)
+    first = linearise(plant, x, (0.0, 0.0), 0.01)
+    kept = first.A.copy()
+    y = x + [0.03, 0.01, 0, 0, 0.1, 0.1]
+    linearise(plant, y, (0.0, 0.0), 0.02)
+    assert (first.A == kept).all()
+
+
+def test_three_rods(poses):
+    robot = load_robot(MODELS / "three_rods.toml")
+    plant = Plant(robot)
+    x = np.array([0.0, 0.115, 0, 0, 1.92, 4.02, -0.17])
+    plant.reset(x)
+    model = linearise(plant, x, np.zeros(3), 0.01)
+    assert (model.A.shape, model.B.shape, model.c.shape) == ((7, 7), (7, 3), (7,))
