@@ -33,7 +33,8 @@ def error_curve(robot: Robot, pose: Equilibrium, method: str) -> tuple[np.ndarra
             move = np.zeros(len(units))
             move[i] = step * unit
             ahead, back = (
-                solve_statics(robot, eq.p + s * move[:2], eq.q + s * move[2:], guess=eq, **options).force for s in (1, -1)
+                solve_statics(robot, eq.p + s * move[:2], eq.q + s * move[2:], guess=eq, **options).force
+                for s in (1, -1)
             )
             columns.append((ahead - back) / (2 * step))
         error = np.array(columns).T - exact * units

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,7 @@ def read_toml(path: str | Path) -> Table:
     ModelError
         If the file is missing or is not TOML.
     """
-    path = Path(path)
+    path = Path(os.path.normpath(path))
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -69,9 +69,7 @@ def test_limit_of_stability_against_table():
 
 def test_mattiasson_1981_cantilever(pendulum):
     """Deflection, shortening and tip angle under a tip force perpendicular to the clamp tangent."""
-    for load, w, shortening, theta_tip in np.genfromtxt(
-        DATA / "mattiasson_1981.csv", delimiter=",", skip_header=3
-    ):
+    for load, w, shortening, theta_tip in np.genfromtxt(DATA / "mattiasson_1981.csv", delimiter=",", skip_header=3):
         root = np.sqrt(load)
         # The force is perpendicular to the tangent at the base where delta = pi/2.
         log_tip_angle = brentq(lambda x, root=root: float(pendulum(x, root)[0]) - np.pi / 2, -20.0, np.log(np.pi / 2))

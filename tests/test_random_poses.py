@@ -28,8 +28,7 @@ def check(pair, count, method, reach, seed, solved_at_least):
         for axis in range(2):
             step = h * np.eye(2)[axis]
             energies = [
-                solve_statics(pair, p + s * step, q, method=method, steps=12, guess=eq).energy
-                for s in (-2, -1, 1, 2)
+                solve_statics(pair, p + s * step, q, method=method, steps=12, guess=eq).energy for s in (-2, -1, 1, 2)
             ]
             gradient.append(np.dot(energies, [1, -8, 8, -1]) / (12 * h))
         size = np.linalg.norm(eq.rod_forces)

@@ -67,10 +67,10 @@ def test_methods_agree(pair, poses, method):
         assert eq.method == method
         for name in ("force", "dforce_dp", "dforce_dq", "motor_torque", "energy", "rod_forces"):
             wanted = np.asarray(getattr(exact, name))
-            assert getattr(eq, name) == pytest.approx(wanted, abs=1e-5 * np.abs(wanted).max())
+            assert getattr(eq, name) == pytest.approx(wanted, abs=5e-5 * np.abs(wanted).max())
         assert eq.mode == exact.mode
         assert eq.stable == exact.stable
-        assert eq.shape(20) == pytest.approx(exact.shape(20), abs=1e-6)
+        assert eq.shape(20) == pytest.approx(exact.shape(20), abs=1e-4)
 
 
 def test_rfrfr_forward(rfrfr):

@@ -57,22 +57,34 @@ class QPSolver:
         m, n = A.shape
         self.n, self.m = n, m
         self._n_hessian = n * (n + 1) // 2
+        self._matrix = A
+        self._settings = {
+            "verbose": False,
+            "eps_abs": tolerance,
+            "eps_rel": tolerance,
+            "max_iter": max_iterations,
+            "adaptive_rho": 1,  # by iterations, not by time
+            "rho": _RHO,
+            "scaling": 2,
+            "check_termination": 5,
+            "polishing": False,
+        }
+        self._dense_a = np.ascontiguousarray(A.toarray())
+        self.reset()
+
+    def reset(self) -> None:
+        """Start afresh, so that the same calls give the same results bit for bit.
+
+        A new workspace: OSQP scales and unscales A at every update of P, and its rounding would stay.
+        """
+        n, m = self.n, self.m
         # An explicit pattern: zeros of the start must not drop out of it.
         rows = np.concatenate([np.arange(j + 1) for j in range(n)])
         starts = np.arange(n + 1) * (np.arange(n + 1) + 1) // 2
         diagonal = (rows == np.repeat(np.arange(n), np.arange(1, n + 1))).astype(float)
         hessian = sp.csc_matrix((diagonal, rows, starts), shape=(n, n))
-        self._dense_a = np.ascontiguousarray(A.toarray())
         self._osqp = osqp.OSQP()
-        self._osqp.setup(
-            hessian, np.zeros(n), A, -np.ones(m), np.ones(m), verbose=False, eps_abs=tolerance, eps_rel=tolerance,
-            max_iter=max_iterations, adaptive_rho=1, rho=_RHO, scaling=2, check_termination=5, polishing=False,
-        )  # fmt: skip
-
-    def reset(self) -> None:
-        """Forget the last solution and the adapted step size, for a reproducible start."""
-        self._require(self._osqp.warm_start(np.zeros(self.n), np.zeros(self.m)), "warm_start")
-        self._osqp.update_settings(rho=_RHO)
+        self._osqp.setup(hessian, np.zeros(n), self._matrix, -np.ones(m), np.ones(m), **self._settings)
 
     def warm_start(self, x: np.ndarray) -> None:
         """Start the next solve from x, shape (n,), keeping the last multipliers."""
@@ -124,7 +136,9 @@ class QPSolver:
         info = core.info
         if info.status_val != osqp.SolverStatus.OSQP_SOLVED:
             status, iterations = info.status, int(info.iter)
-            self.reset()  # an unsolved problem's iterate must not start the next one
+            # An unsolved problem's iterate and step size must not start the next one.
+            self._require(self._osqp.warm_start(np.zeros(self.n), np.zeros(self.m)), "warm_start")
+            self._osqp.update_settings(rho=_RHO)
             raise InfeasibleError(
                 f"the QP was not solved: {status} after {iterations} iterations; "
                 "relax the limits, shorten the horizon or raise max_iterations",

@@ -66,8 +66,8 @@ def propagation(steps: int, scheme: str = "rk4") -> Any:
 
 
 @lru_cache
-def _sampler(n_points: int) -> Any:
-    return propagation(8, "rk8").map(n_points)
+def _sampler(n_points: int, steps: int) -> Any:
+    return propagation(steps, "rk8").map(n_points)
 
 
 def sample_rod(nodes: np.ndarray, n_points: int) -> np.ndarray:
@@ -86,10 +86,11 @@ def sample_rod(nodes: np.ndarray, n_points: int) -> np.ndarray:
         x, y (relative to the base), theta, n_x, n_y, m; normalised.
     """
     n_nodes = nodes.shape[1]
-    whole = _sampler(n_nodes)(nodes, np.full((1, n_nodes), 1.0 / n_nodes)).full()
+    steps = max(4, 32 // n_nodes)
+    whole = _sampler(n_nodes, steps)(nodes, np.full((1, n_nodes), 1.0 / n_nodes)).full()
     starts = np.concatenate([np.zeros((2, 1)), np.cumsum(whole[:2], axis=1)], axis=1)
     s = np.linspace(0.0, 1.0, n_points)
     piece = np.minimum((s * n_nodes).astype(int), n_nodes - 1)
-    ends = _sampler(n_points)(nodes[:, piece], (s - piece / n_nodes)[None, :]).full()
+    ends = _sampler(n_points, steps)(nodes[:, piece], (s - piece / n_nodes)[None, :]).full()
     ends[:2] += starts[:, piece]
     return np.asarray(ends[:6])

@@ -1,0 +1,118 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcr_mpc import InfeasibleError, LinearMPC, Plant, Reference, linearise, load_tuning
+from pcr_mpc.control.tuning import Limits
+
+from .conftest import CONTROLLERS
+
+
+@pytest.fixture(scope="module")
+def tuning():
+    return load_tuning(CONTROLLERS / "default.toml")
+
+
+@pytest.fixture(scope="module")
+def target(centre):
+    return np.concatenate([centre.p, [0, 0], centre.q])
+
+
+@pytest.fixture(scope="module")
+def model(pair, centre, target):
+    plant = Plant(pair)
+    plant.reset(target, centre)
+    return linearise(plant, target, (0.0, 0.0), 0.01)
+
+
+@pytest.fixture
+def reference(tuning, target):
+    return Reference(np.tile(target, (tuning.horizon, 1)), np.zeros((tuning.horizon, 2)))
+
+
+def far(target):
+    return target + np.array([0.02, -0.03, 0, 0, 0, 0])
+
+
+def test_limits_hold_exactly(tuning, target, model, reference, pair):
+    limits = Limits(1.5, 0.7, *pair.angle_limits.T)
+    mpc = LinearMPC(tuning, limits)
+    x, u = far(target), np.zeros(2)
+    for _ in range(150):
+        plan = mpc.solve(x, model, reference, u)
+        assert plan.status == "solved"
+        assert np.abs(plan.inputs[0]).max() <= 1.5
+        assert np.abs(plan.inputs[0] - u).max() <= 0.7 + 1e-12
+        assert plan.primal_residual < 1e-4
+        assert np.isfinite([plan.dual_residual, plan.update_time, plan.solve_time]).all()
+        u = plan.inputs[0]
+        x = model(x, u)
+    assert np.abs(x[:2] - target[:2]).max() < 1e-3
+
+
+def test_angle_limits_hold_in_the_plan(tuning, target, model, reference):
+    limits = Limits(6.0, 6.0, target[4:] - 0.02, target[4:] + 0.02)
+    mpc = LinearMPC(tuning, limits)
+    plan = mpc.solve(far(target), model, reference, np.zeros(2))
+    angles = plan.states[1:, 4:]
+    assert np.abs(angles - target[4:]).max() <= 0.02 + 1e-4
+    free = LinearMPC(tuning, Limits(6.0, 6.0, target[4:] - 9, target[4:] + 9))
+    assert np.abs(free.solve(far(target), model, reference, np.zeros(2)).states[1:, 4:] - target[4:]).max() > 0.03
+
+
+def test_leaving_rows_out_first_changes_nothing(tuning, target, model, reference, pair):
+    """The plan under active limits on the change of rate equals that of the whole QP."""
+    from pcr_mpc import build_qp
+    from pcr_mpc.control.mpc import terminal_weight
+    from pcr_mpc.control.osqp_solver import QPSolver
+
+    tuning = replace(tuning, tolerance=1e-9)
+    limits = Limits(3.0, 0.5, *pair.angle_limits.T)
+    plan = LinearMPC(tuning, limits).solve(far(target), model, reference, np.zeros(2))
+    qp = build_qp(far(target), model, reference, np.zeros(2), tuning, limits, terminal_weight(model, tuning))
+    solver = QPSolver(qp.A, 1e-9)
+    solver.update(qp.P, qp.q, qp.l, qp.u)
+    assert plan.inputs.ravel() == pytest.approx(solver.solve().x, abs=1e-5)
+
+
+def test_an_infeasible_problem_raises_if_there_is_no_plan(tuning, target, model, reference):
+    limits = Limits(1.0, 6.0, target[4:] + 0.5, target[4:] + 1.0)  # the motors cannot get there in one horizon
+    with pytest.raises(InfeasibleError, match="not solved"):
+        LinearMPC(tuning, limits).solve(target, model, reference, np.zeros(2))
+
+
+@pytest.mark.parametrize("fallback", ["shifted_plan", "raise"])
+def test_an_unsolved_problem_is_replaced_or_raised_never_hidden(tuning, target, model, reference, pair, fallback):
+    mpc = LinearMPC(replace(tuning, fallback=fallback), Limits(6.0, 3.0, *pair.angle_limits.T))
+    first = mpc.solve(far(target), model, reference, np.zeros(2))
+    outside = target.copy()
+    outside[4] = pair.angle_limits[0, 1] + 1.0
+    if fallback == "raise":
+        with pytest.raises(InfeasibleError):
+            mpc.solve(outside, model, reference, first.inputs[0])
+        return
+    plan = mpc.solve(outside, model, reference, first.inputs[0])
+    assert plan.fallback == "shifted_plan"
+    assert plan.status != "solved"
+    assert np.isnan(plan.primal_residual)
+    assert (plan.inputs[:-1] == first.inputs[1:]).all()
+    after = mpc.solve(far(target), model, reference, plan.inputs[0])
+    assert (after.status, after.fallback) == ("solved", None)
+
+
+def test_reset_repeats_bit_for_bit(tuning, target, model, reference, pair):
+    mpc = LinearMPC(tuning, Limits(2.0, 1.0, *pair.angle_limits.T))
+
+    def run():
+        x, u, found = far(target), np.zeros(2), []
+        for _ in range(10):
+            plan = mpc.solve(x, model, reference, u)
+            u = plan.inputs[0]
+            x = model(x, u)
+            found.append(plan.inputs)
+        return np.array(found)
+
+    first = run()
+    mpc.reset()
+    assert (run() == first).all()
