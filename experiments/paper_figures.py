@@ -51,7 +51,7 @@ def figure_3(folder: Path) -> None:
     path_axes.plot(*(1e3 * run.x[:, :2].T), color=BLUE, lw=1.2)
     path_axes.plot(*(1e3 * run.x[0, :2]), "o", color="black", label="start")
     path_axes.set(xlabel="x [mm]", ylabel="y [mm]", title="Path of the tip", aspect="equal")
-    path_axes.legend()
+    path_axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.25))
     figure.tight_layout()
     figure.savefig(folder / "paper_fig3.png")
     plt.close(figure)
