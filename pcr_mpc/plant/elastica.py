@@ -5,7 +5,7 @@ the tip), released at rest at the tip from delta = tip_angle (see `chart`). With
 k = cos(tip_angle / 2),
 
     sin(delta/2) = k' nd(u),    cos(delta/2) = k cd(u),    delta' = int sin(delta) du = 2 k k' sd(u),
-    int cos(delta) du = u - 2 (E(am u) - k^2 sn(u) cd(u)),
+    int cos(delta) du = u - 2 D(u),    D = E(am u) - k^2 sn(u) cd(u),
 
 so (log tip_angle, lambda) gives the tip, the force and the moment explicitly, and statics is a 2 x 2 Newton
 iteration per rod. The logarithm is the variable because a taut rod has tip_angle of the order of exp(-lambda).
@@ -23,13 +23,16 @@ from .rod import sample_rod
 
 # Ascending Landen steps: k' falls below 1e-16 from any k >= 1e-6.
 _LANDEN_STEPS = 8
+# Angles below this, taken from nodes, are not trusted.
+_ROUNDING = 1e-5
 
 
 def elliptic(u: Any, k: Any, k_prime: Any) -> tuple[Any, Any, Any, Any]:
-    """Sn, cn, dn and E(am u) by ascending Landen transformations, with a fixed number of operations.
+    """Sn, cn, dn and D = k'^2 int nd^2 du by ascending Landen transformations, with a fixed number of operations.
 
-    The modulus is driven to 1, where the functions are hyperbolic, so that k' may be as small as it likes
-    (DLMF 22.7.6-8 and 19.8.13; k and k' are both arguments, for neither may come from the other).
+    The modulus is driven to 1, where the functions are hyperbolic and D = 0, so that k' may be as small as it
+    likes (DLMF 22.7.6-8; k and k' are both arguments, for neither may come from the other). With
+    D = E(am u) - k^2 sn cd, DLMF 19.8.13 becomes a sum of positive terms: nothing cancels.
     """
     moduli, factor = [], ca.SX(1)
     for _ in range(_LANDEN_STEPS):
@@ -38,23 +41,23 @@ def elliptic(u: Any, k: Any, k_prime: Any) -> tuple[Any, Any, Any, Any]:
         k, k_prime = 2 * ca.sqrt(k) / (1 + k), (k_prime / (1 + k)) ** 2
     u = u * factor
     sn, dn = ca.tanh(u), 1 / ca.cosh(u)
-    cn, epsilon = dn, sn
+    cn, d = dn, ca.SX(0)
     for k, k_prime in reversed(moduli):
         up = (k_prime / (1 + k)) ** 2  # complementary modulus one step up
         ratio = up / dn
         sn, cn, dn = 2 / (1 + k) * sn * cn / dn, (1 + k) / (2 * k) * (dn - ratio), (1 + k) / 2 * (dn + ratio)
-        epsilon = (1 + k) * epsilon + k_prime**2 / (1 + k) * u - k * sn
+        d = (1 + k) * d + k_prime**2 / (1 + k) * u + k * sn * (1 - k * cn / dn)
         u = u * 2 / (1 + k)
-    return sn, cn, dn, epsilon
+    return sn, cn, dn, d
 
 
 def pendulum(log_tip_angle: Any, u: Any) -> tuple[Any, Any, Any]:
     """Angle delta, its rate d delta/du and int cos(delta) du at u."""
     half = ca.exp(log_tip_angle) / 2
     k, k_prime = ca.cos(half), ca.sin(half)
-    sn, cn, dn, epsilon = elliptic(u, k, k_prime)
+    sn, cn, dn, d = elliptic(u, k, k_prime)
     delta = 2 * ca.atan2(k_prime / dn, k * cn / dn)
-    return delta, 2 * k * sn * (k_prime / dn), u - 2 * (epsilon - k * k * sn * cn / dn)
+    return delta, 2 * k * sn * (k_prime / dn), u - 2 * d
 
 
 @lru_cache
@@ -127,10 +130,13 @@ def from_nodes(states: np.ndarray) -> np.ndarray:
     theta = np.append(states[0], sample_rod(states, 2)[2, -1])
     delta = np.angle(np.exp(1j * (psi - theta)))
     u = load * np.append(1 - np.arange(states.shape[1]) / states.shape[1], 0.0)
-    # The last place at which delta is above rounding: the tip itself, unless the rod is taut there.
-    last = np.flatnonzero(np.abs(delta) > 1e-5)
-    j = int(last[-1]) if last.size else 0
-    size = max(abs(float(delta[j])), 1e-12)
-    # From there on a taut rod is on the separatrix, tan(delta/4) = tan(tip_angle/4) cosh(u).
-    log_tip_angle = np.log(4.0 * np.tan(size / 4.0)) - np.logaddexp(u[j], -u[j]) + np.log(2.0) if u[j] else np.log(size)
-    return np.array([log_tip_angle, load, np.sign(delta[j]) or 1.0])
+    if abs(delta[-1]) > _ROUNDING:
+        return np.array([np.log(abs(delta[-1])), load, np.sign(delta[-1])])
+    # A taut rod: delta is all rounding at the tip. From the last node where it is not, the rod is on the
+    # separatrix, tan(delta/4) = tan(tip_angle/4) cosh(u), and turns the same way all along.
+    above = np.flatnonzero(np.abs(delta[:-1]) > _ROUNDING)
+    j = int(above[-1]) if above.size else 0
+    hand = 1.0 if states[3, j] >= 0 else -1.0
+    size = max(float(hand * delta[j]) % (2 * np.pi), 1e-12)
+    log_cosh = np.logaddexp(u[j], -u[j]) - np.log(2.0)
+    return np.array([np.log(4.0 * np.tan(size / 4.0)) - log_cosh, load, hand])

@@ -95,8 +95,10 @@ class Equilibrium:
         letters = []
         for nodes in self.nodes:
             _, _, theta, n_x, n_y, _ = sample_rod(nodes, 2)[:, -1]
-            # Near the moment-free tip the rod turns as -m'(L) = n_y cos(theta) - n_x sin(theta).
-            letters.append("R" if n_y * np.cos(theta) > n_x * np.sin(theta) else "L")
+            # Near the moment-free tip the rod turns as -m'(L) = n_y cos(theta) - n_x sin(theta); a taut rod has
+            # no turn left there, but keeps the sense of its last node.
+            turn = (n_y * np.cos(theta) - n_x * np.sin(theta)) / np.hypot(n_x, n_y)
+            letters.append("R" if (turn if abs(turn) > 1e-5 else nodes[3, -1]) > 0 else "L")
         return "".join(letters)
 
     def shape(self, n_points: int = 50) -> np.ndarray:
