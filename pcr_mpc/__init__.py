@@ -21,6 +21,7 @@ from .plant.dynamics import Plant
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
 from .plant.robot import Robot, Rod, load_robot
+from .plant.stability import Stability, all_equilibria, assess_stability, distance_to_fold
 from .plant.statics import solve_statics
 
 __all__ = [
@@ -42,11 +43,15 @@ __all__ = [
     "Run",
     "Scene",
     "SimulationError",
+    "Stability",
     "TrackingMPC",
     "Tuning",
     "UnreachableError",
     "UnstableError",
+    "all_equilibria",
+    "assess_stability",
     "build_qp",
+    "distance_to_fold",
     "forward_statics",
     "inverse_statics",
     "linearise",

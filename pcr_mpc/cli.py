@@ -18,11 +18,13 @@ from .loop.scene import load_scene
 from .loop.simulate import simulate
 from .loop.timing import time_scene
 from .plant.dynamics import Plant
+from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
 from .plant.robot import load_robot
+from .plant.stability import all_equilibria, assess_stability
 from .plant.statics import METHODS, solve_statics
-from .report.plots import animate_run, plot_equilibrium, plot_run
-from .report.tables import equilibrium_record, equilibrium_table, summary_table, times_table
+from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
+from .report.tables import equilibria_table, equilibrium_record, equilibrium_table, summary_table, times_table
 
 _EXAMPLES = """\
 examples:
@@ -30,6 +32,7 @@ examples:
   pcr-mpc track models/scenes/limited.toml --json        the same figures for a machine
   pcr-mpc statics models/planar_pair.toml --p 0 0.25 --mode LR     motor angles that hold the tip there
   pcr-mpc statics models/rfrfr.toml --q 120 60 --degrees           where the free tip comes to rest
+  pcr-mpc statics models/planar_pair.toml --p 0.18 0.12 --equilibria   what else it could snap to
   pcr-mpc timing models/scenes/lemniscate.toml           step times against the real-time budgets
 """
 
@@ -88,6 +91,12 @@ def _parser() -> argparse.ArgumentParser:
                          help="external force on the tip [N], where p or q is to be found (default 0 0)")  # fmt: skip
     statics.add_argument("--mode", help="working mode to look for, a letter L or R per rod, such as LR")
     statics.add_argument("--method", choices=METHODS, default="closed_form", help="where both p and q are given")
+    statics.add_argument(
+        "--equilibria",
+        action="store_true",
+        help="list every equilibrium, with its verdict: with --p and --q of the held tip, with --q of the free one, "
+        "with --p of the held tip at the motor angles that balance it",
+    )
     statics.add_argument("--picture", type=Path, metavar="FILE", help="draw the pose into FILE")
 
     timing = command("timing", _timing, "Time plant steps of every method and the control step against their budgets.")
@@ -141,9 +150,28 @@ def _statics(options: argparse.Namespace) -> int:
         eq = forward_statics(robot, q, options.force)
     else:
         raise ValueError("give --p, --q or both")
+    if options.equilibria:
+        return _equilibria(options, eq)
     print(json.dumps(equilibrium_record(eq)) if options.json else equilibrium_table(eq))
     if options.picture:
         plot_equilibrium(eq, options.picture)
+    return 0
+
+
+def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:
+    found = all_equilibria(eq.robot, None if options.p is None else eq.p, eq.q, options.force)
+    if options.json:
+        records = [
+            {**equilibrium_record(one), "unstable_directions": assess_stability(one).unstable_directions}
+            for one in found
+        ]
+        print(json.dumps(records))
+    else:
+        print(equilibria_table(found))
+    picture = options.picture or Path("results") / "equilibria.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plot_equilibria(found, picture)
+    print(f"drawn in {picture}", file=sys.stderr)
     return 0
 
 

@@ -80,7 +80,8 @@ def test_mattiasson_1981_cantilever(pendulum):
 
 
 @pytest.mark.parametrize(
-    "unknowns", [[1.0, 2.0, 1], [-3.0, 6.0, -1], [-20.0, 21.0, 1], [-130.0, 132.3, 1], [-130.0, 131.5, -1], [-150, 140, 1]]
+    "unknowns",
+    [[1.0, 2.0, 1], [-3.0, 6.0, -1], [-20.0, 21.0, 1], [-130.0, 132.3, 1], [-130.0, 131.5, -1], [-150, 140, 1]],
 )
 def test_unknowns_from_nodes(unknowns):
     """A start from nodes keeps the hand, also of a taut rod clamped against the pull (delta beyond pi)."""

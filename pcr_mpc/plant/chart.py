@@ -12,21 +12,25 @@ the sheet of stable shapes is tabulated once, and a tip position is looked up by
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import casadi as ca
 import numpy as np
+from scipy.optimize import brentq
+
+from ..buffered import BufferedFunction
+from . import elastica
 
 _MAX_LOAD = 600.0  # largest lambda on the sheet, about
 _LAMBDA_STEPS = 480  # RK4 steps along each trajectory
 _COLUMNS = 96  # columns of the tabulated sheet
 _LAUNCH = 1e-4  # delta up to which the pendulum is linear to rounding
+_LOOPED = -13.0  # log(tip_angle) below which the chart stops short of the full loop where stability ends
 _TAUT = -21.0  # log(tip_angle) below which that stretch is skipped
-_POLISH_STEPS = 512  # RK4 steps of the exact tip map
-_POLISHED = 1e-8  # distance from the target, in units of L
+_POLISHED = 1e-12  # distance from the target, in units of L
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,13 @@ class HeldShape:
     log_tip_angle: float
     load: float
     energy: float
+
+    def stable(self) -> bool:
+        """Whether the load is below lambda_c."""
+        table = _chart()
+        # Far below the tabulated limit there is no need to find it exactly.
+        near = 0.7 * float(np.interp(self.log_tip_angle, table.rows, table.limits))
+        return self.load < near or self.load < critical_load(self.log_tip_angle)
 
     def polished(self, xi: float, eta: float) -> HeldShape | None:
         """The exact shape near this one whose tip is at (xi, eta), or None if Newton's method finds none."""
@@ -96,6 +107,40 @@ class HeldShape:
         )
 
 
+def stable_shapes(xi: float, eta: float) -> list[HeldShape]:
+    """Every stable shape of a rod clamped at the origin along +x with its tip at (xi, eta), exact, by energy.
+
+    Complete to the resolution of the chart: pairs of shapes that merge at a fold closer than about 1e-3 in
+    (xi, eta), and shapes that carry more than 1e5 EI/L^2, may be missed.
+    """
+    found: list[HeldShape] = []
+    for coarse in held_shapes(xi, eta):
+        shape = coarse.polished(xi, eta)
+        if shape is None or not shape.stable():
+            continue
+        if all(shape.hand != other.hand or abs(shape.load - other.load) > 1e-5 * shape.load for other in found):
+            found.append(shape)
+    return sorted(found, key=lambda shape: shape.energy)
+
+
+def critical_load(log_tip_angle: float) -> float:
+    """lambda_c, the load at which a rod with its tip held loses stability; inf beyond the chart's most taut rods."""
+    chart = _chart()
+    if log_tip_angle < _LOOPED:
+        return np.inf
+    guess = float(np.interp(log_tip_angle, chart.rows, chart.limits))
+
+    def determinant(load: float) -> float:
+        return float(np.linalg.det(_evaluate_tip(np.array([log_tip_angle, load]), np.zeros(2))[1]))
+
+    # The table is good to a few per cent at most (where lambda_c jumps, between two of its rows).
+    for width in (0.02, 0.1, 0.4):
+        low, high = guess * (1 - width), guess * (1 + width)
+        if determinant(low) * determinant(high) < 0:
+            return float(brentq(determinant, low, high, xtol=1e-10))
+    return guess
+
+
 def held_shapes(xi: float, eta: float) -> list[HeldShape]:
     """Stable shapes of a rod clamped at the origin along +x with its tip at (xi, eta), in units of L.
 
@@ -124,28 +169,16 @@ def held_shapes(xi: float, eta: float) -> list[HeldShape]:
 
 def _evaluate_tip(unknowns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Tip minus target, its Jacobian in (log tip_angle, load), and the energy."""
-    tip, jacobian, energy = _tip_map()(unknowns)
-    return tip.full().ravel() - target, jacobian.full(), float(energy)
+    function = _tip_map(threading.get_ident())
+    function.inputs[0][:] = unknowns
+    function()
+    tip, jacobian, energy = function.outputs
+    return tip - target, jacobian.copy(), float(energy[0])
 
 
 @lru_cache
-def _tip_map() -> Any:
-    state, h, unknowns = ca.SX.sym("state", 4), ca.SX.sym("h"), ca.MX.sym("unknowns", 2)
-
-    def slope(x: Any) -> Any:
-        return ca.vertcat(x[1], ca.sin(x[0]), ca.cos(x[0]), ca.sin(x[0]))
-
-    step = ca.Function("step", [state, h], [_rk4(slope, state, h)]).fold(_POLISH_STEPS)
-    log_tip_angle, load = unknowns[0], unknowns[1]
-    tip_angle, taut = ca.exp(log_tip_angle), log_tip_angle < _TAUT
-    launch = ca.if_else(taut, np.log(2.0 * _LAUNCH) - log_tip_angle, 0.0)
-    small = ca.if_else(taut, _LAUNCH, 0.0)
-    start = ca.vertcat(ca.if_else(taut, _LAUNCH, tip_angle), small, launch, small)
-    end = step(start, ca.repmat((load - launch) / _POLISH_STEPS, 1, _POLISH_STEPS))
-    cos, sin, c, s = ca.cos(end[0]), ca.sin(end[0]), end[2], end[3]
-    tip = ca.vertcat(cos * c + sin * s, sin * c - cos * s) / load
-    energy = load**2 * ca.cos(tip_angle) - load * c
-    return ca.Function("tip_map", [unknowns], [tip, ca.jacobian(tip, unknowns), energy])
+def _tip_map(thread: int) -> BufferedFunction:
+    return BufferedFunction(elastica.tip_map())
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +189,8 @@ class _Chart:
     energy: np.ndarray  # (M,)
     corners: np.ndarray  # (T, 3) indices of each triangle's corners
     triangles: np.ndarray  # (T, 3, 2) their positions
+    rows: np.ndarray  # log tip_angle of each trajectory
+    limits: np.ndarray  # its last stable load
 
 
 @lru_cache
@@ -185,6 +220,8 @@ def _chart() -> _Chart:
         energy=columns[3].ravel(),
         corners=corners,
         triangles=points[corners],
+        rows=log_tip_angle,
+        limits=loads[:, -1],
     )
 
 

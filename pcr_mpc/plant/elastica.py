@@ -23,6 +23,7 @@ from .rod import sample_rod
 
 # Ascending Landen steps: k' falls below 1e-16 from any k >= 1e-6.
 _LANDEN_STEPS = 8
+_SWEEP = 60  # points along the rod at which conjugate points are looked for
 # Angles below this, taken from nodes, are not trusted.
 _ROUNDING = 1e-5
 
@@ -60,6 +61,23 @@ def pendulum(log_tip_angle: Any, u: Any) -> tuple[Any, Any, Any]:
     return delta, 2 * k * sn * (k_prime / dn), u - 2 * d
 
 
+def _tip(log_tip_angle: Any, load: Any) -> tuple[Any, Any, Any, Any]:
+    """Tip seen from the clamp (left-handed rod), delta and rate at the base, energy."""
+    delta, rate, c = pendulum(log_tip_angle, load)
+    cos, sin = ca.cos(delta), ca.sin(delta)
+    # The rate is also int sin(delta) du.
+    tip = ca.vertcat(cos * c + sin * rate, sin * c - cos * rate) / load
+    return tip, delta, rate, load**2 * ca.cos(ca.exp(log_tip_angle)) - load * c
+
+
+@lru_cache
+def tip_map() -> Any:
+    """Graph [log tip_angle, lambda] -> tip (2), its Jacobian (2, 2), energy, for a left-handed rod."""
+    unknowns = ca.SX.sym("unknowns", 2)
+    tip, _, _, energy = _tip(unknowns[0], unknowns[1])
+    return ca.Function("tip_map", [unknowns], [tip, ca.jacobian(tip, unknowns), energy], {"cse": True})
+
+
 @lru_cache
 def rod_newton() -> tuple[Any, Any]:
     """Build the graphs of one rod; same arguments and results as `multiple_shooting.rod_newton`.
@@ -69,10 +87,8 @@ def rod_newton() -> tuple[Any, Any]:
     """
     unknowns, pose = ca.SX.sym("unknowns", 3), ca.SX.sym("pose", 3)
     load, hand = unknowns[1], unknowns[2]
-    delta, rate, c = pendulum(unknowns[0], load)
-    cos, sin = ca.cos(delta), ca.sin(delta)
-    # Tip seen from the clamp, mirrored for the right hand: s = int sin(delta) du is the rate.
-    tip = ca.vertcat(cos * c + sin * rate, sin * c - cos * rate) / load
+    tip, delta, rate, energy = _tip(unknowns[0], load)
+    # The target is seen from the clamp, mirrored for the right hand.
     turn = ca.vertcat(
         ca.horzcat(ca.cos(pose[2]), ca.sin(pose[2])), hand * ca.horzcat(-ca.sin(pose[2]), ca.cos(pose[2]))
     )
@@ -90,7 +106,6 @@ def rod_newton() -> tuple[Any, Any]:
     # Implicit function theorem: the unknowns follow the target.
     moves = inverse @ ca.jacobian(target, pose)
     load_moves = ca.jacobian(loads, unknowns[:2]) @ moves + ca.jacobian(loads, pose)
-    energy = load**2 * ca.cos(ca.exp(unknowns[0])) - load * c
     norm = ca.norm_2(residual)
     # The determinant is negative on the stable sheet, and its first zero is the limit of stability.
     scalars = ca.vertcat(norm, ca.norm_2(step), energy, determinant >= 0, 0)
@@ -121,6 +136,28 @@ def _nodes(n_nodes: int) -> Any:
 def nodes(unknowns: np.ndarray, angle: float, n_nodes: int) -> np.ndarray:
     """States [theta, n_x, n_y, m] at s = j/n_nodes, shape (4, n_nodes), normalised."""
     return np.asarray(_nodes(n_nodes)(unknowns, angle).full())
+
+
+@lru_cache
+def _determinants() -> Any:
+    unknowns, pose = ca.SX.sym("unknowns", 3), ca.DM.zeros(3)
+    newton, _ = rod_newton()
+    beyond = newton(unknowns, pose)[4][3]
+    return ca.Function("beyond", [unknowns], [beyond]).map(_SWEEP)
+
+
+def conjugate_points(unknowns: np.ndarray) -> int:
+    """Unstable directions of a rod with its tip held: the zeros of the determinant between tip and base.
+
+    The part of a rod within s of its tip is a rod with the same tip angle and the load lambda s.
+    """
+    # No zero lies before the quarter period K(k), where on a taut rod the determinant is all rounding.
+    first = max(5.7, np.log(8.0) - unknowns[0])
+    if unknowns[1] <= first:
+        return 0
+    columns = np.stack([np.full(_SWEEP, unknowns[0]), np.linspace(first, unknowns[1], _SWEEP), np.ones(_SWEEP)])
+    beyond = _determinants()(columns).full().ravel()
+    return int(np.count_nonzero(np.diff(beyond)))
 
 
 def from_nodes(states: np.ndarray) -> np.ndarray:

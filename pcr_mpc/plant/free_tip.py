@@ -55,14 +55,14 @@ def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equili
         n_steps = int(np.ceil(np.abs(q - guess.q).max() / _ANGLE_STEP)) + 1
         p = guess.p
         for t in np.linspace(0.0, 1.0, n_steps + 1)[1:]:
-            p = _settle(solver, p, guess.q + t * (q - guess.q), guess.force + t * (force - guess.force))
+            p = settle(solver, p, guess.q + t * (q - guess.q), guess.force + t * (force - guess.force))
         return solver.equilibrium(p, q)
     found: list[Equilibrium] = []
     last: PCRError | None = None
     for start in _tip_starts(robot, q):
         try:
             solver.start(start, q)
-            found.append(solver.equilibrium(_settle(solver, start, q, force), q))
+            found.append(solver.equilibrium(settle(solver, start, q, force), q))
         except PCRError as error:
             last = error
     if not found:
@@ -131,8 +131,8 @@ def inverse_statics(
     return min(found, key=lambda eq: eq.energy)
 
 
-def _settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Descend the potential energy U(p, q) - force . p by Newton's method with a bounded step."""
+def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Descend the potential energy U(p, q) - force . p to a stable pose, by Newton's method with a bounded step."""
     robot = solver.robot
     tolerance = _FORCE_TOLERANCE * _force_scale(robot)
     solver.move(p, q)

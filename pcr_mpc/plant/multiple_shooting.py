@@ -47,7 +47,7 @@ from .robot import Robot
 from .rod import propagation
 
 # A straight tail has determinant 0; with orthonormal rows, less than this is rounding.
-_DETERMINANT_ROUNDING = 1e-15
+_DETERMINANT_ROUNDING = 1e-12
 
 
 @lru_cache
@@ -85,12 +85,14 @@ def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
 
     conditions = ca.vertcat(ca.SX.eye(6)[:2, :], ca.SX.eye(6)[5, :])
     t, r = [conditions], [-ca.vertcat(position, moment)]
-    conjugate_points = ca.SX(0)
+    conjugate_points, crossed = ca.SX(0), ca.SX(0)
     for j in range(n - 1, -1, -1):
         rows, rhs = _orthonormal_rows(t[0] @ transition[j], r[0] - t[0] @ gap[j])
         t.insert(0, rows)
         r.insert(0, rhs)
-        conjugate_points += _determinant3(rows[:, 3:]) < -_DETERMINANT_ROUNDING
+        negative = _determinant3(rows[:, 3:]) < -_DETERMINANT_ROUNDING
+        conjugate_points += negative != crossed
+        crossed = negative
 
     # Forward: column 0 is the Newton step; the others start from a moved or turned base. Moving the tip
     # is moving the base the other way, so the tangent with respect to d has the opposite sign.

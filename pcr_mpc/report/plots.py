@@ -48,6 +48,26 @@ def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
     plt.close(figure)
 
 
+def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
+    """Draw all equilibria side by side, in the order of their energies."""
+    columns = min(4, len(found))
+    rows = -(-len(found) // columns)
+    figure, panels = plt.subplots(
+        rows, columns, figsize=(3.2 * columns, 3.2 * rows), squeeze=False, layout="constrained"
+    )
+    everything = np.concatenate([eq.shape(60).reshape(-1, 2) for eq in found])
+    for axes, eq in zip(panels.flat, found, strict=False):
+        draw_robot(axes, eq, alpha=1.0 if eq.stable else 0.5)
+        frame(axes, everything)
+        axes.label_outer()
+        axes.set_title(f"{eq.mode}, {'stable' if eq.stable else 'unstable'}, {eq.energy:.3f} J", fontsize=9,
+                       color="black" if eq.stable else RED)  # fmt: skip
+    for axes in panels.flat[len(found) :]:
+        axes.set_visible(False)
+    figure.savefig(path)
+    plt.close(figure)
+
+
 def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
     """Rods at some of the run's states, followed from one to the next."""
     plant = Plant(run.scene.robot, method="closed_form", dt=run.scene.plant.dt)

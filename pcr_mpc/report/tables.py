@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..plant.equilibrium import Equilibrium
+from ..plant.stability import assess_stability
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -84,6 +85,27 @@ def equilibrium_record(eq: Equilibrium) -> dict[str, Any]:
         "drift": eq.drift,
         "converged": eq.converged,
     }
+
+
+def equilibria_table(found: Sequence[Equilibrium]) -> str:
+    """One line for each equilibrium, with its verdict."""
+    rows = []
+    for number, eq in enumerate(found, start=1):
+        stability = assess_stability(eq)
+        verdict = "stable" if stability.stable else f"{stability.unstable_directions} unstable"
+        rows.append(
+            (
+                f"{number} {eq.mode}",
+                verdict,
+                f"{eq.energy:.4f}",
+                f"({eq.p[0]:.4f}, {eq.p[1]:.4f})",
+                f"({eq.force[0]:.3f}, {eq.force[1]:.3f})",
+                " ".join(f"{margin:.2f}" for margin in stability.rod_margins),
+                f"{stability.stiffness_eigenvalues[0]:.4g}",
+            )
+        )
+    header = ("shape", "verdict", "U [J]", "tip [m]", "F [N]", "rod margins", "least K [N/m]")
+    return table(header, rows)
 
 
 def equilibrium_table(eq: Equilibrium) -> str:
