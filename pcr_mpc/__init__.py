@@ -12,7 +12,8 @@ from .errors import (
     UnreachableError,
     UnstableError,
 )
-from .linearisation.model import LinearModel, linearise
+from .linearisation.linear_model import LinearModel
+from .linearisation.linearise import linearise
 from .loop.controllers import HoldMotors, TrackingMPC, make_controller
 from .loop.run import Run
 from .loop.scene import Scene, load_scene

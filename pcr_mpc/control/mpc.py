@@ -11,7 +11,7 @@ import control
 import numpy as np
 
 from ..errors import InfeasibleError
-from ..linearisation.model import LinearModel
+from ..linearisation.linear_model import LinearModel
 from .osqp_solver import QPSolver, Solution
 from .qp import QuadraticProgram, Reference, build_qp, constraint_matrix
 from .tuning import Limits, Tuning

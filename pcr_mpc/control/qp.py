@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..buffered import BufferedFunction
-from ..linearisation.model import LinearModel
+from ..linearisation.linear_model import LinearModel
 from .tuning import Limits, Tuning
 
 

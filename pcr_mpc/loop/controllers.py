@@ -12,7 +12,7 @@ from ..control.mpc import LinearMPC, Plan
 from ..control.qp import Reference
 from ..control.tuning import Limits, Tuning
 from ..errors import PCRError
-from ..linearisation.model import linearise
+from ..linearisation.linearise import linearise
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import inverse_statics

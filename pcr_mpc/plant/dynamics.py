@@ -15,8 +15,8 @@ from .statics import checked_shooting, make_solver
 
 # A simulation uses the derivatives only to predict the next pose.
 _PREDICTOR_ACCURACY = 1e-2
-# Relative drift of a rod's invariant at which its force is off by a few per cent.
-_LARGEST_DRIFT = 1e-3
+# Relative drift of a rod's invariant beyond which its force may be off by more than a per cent.
+_LARGEST_DRIFT = 1e-4
 
 
 class Plant:
@@ -27,7 +27,7 @@ class Plant:
     Parameters
     ----------
     robot : Robot
-    method : {"multiple_shooting", "single_shooting"}
+    method : {"closed_form", "multiple_shooting", "single_shooting"}
         Statics of the rods.
     segments, steps, scheme
         Discretisation, see `solve_statics`.
@@ -74,12 +74,12 @@ class Plant:
         x = checked_vector("x", x, self.n_states)
         p, q = x[:2], x[4:]
         self.robot.require_reachable(p)
+        self._at = None
         if guess is None:
             self._solver.start(p, q)
         else:
             self._solver.start(guess.p, guess.q, guess.nodes)
-            self._solver.move(p, q)
-        self._at = (*p.tolist(), *q.tolist())
+        self._go(p, q, TOLERANCE)
 
     def step(self, x: Any, u: Any, f_ext: Any = (0.0, 0.0)) -> np.ndarray:
         """Advance by one time step with the motor rates held.
@@ -106,9 +106,11 @@ class Plant:
         u = checked_vector("u", u, self.robot.n_rods)
         f_ext = checked_vector("f_ext", f_ext, 2)
         limit = self.robot.rate_limit
+        # A motor that would pass its stop within the step arrives there at the end of it; one that is beyond
+        # its stop comes back no faster than it can.
         rate = np.minimum(np.maximum(u, -limit), limit)
-        # A motor that would pass its stop within the step arrives there at the end of it.
         rate = (np.minimum(np.maximum(x[4:] + self.dt * rate, self._lower), self._upper) - x[4:]) / self.dt
+        rate = np.minimum(np.maximum(rate, -limit), limit)
         try:
             return self._advance(self, x, rate, f_ext)
         except PCRError as error:
@@ -151,6 +153,7 @@ class Plant:
             raise
         unstable = self._solver.unstable_rods()
         if unstable:
+            self._solver.go_back()
             raise UnstableError(
                 f"rod {unstable[0]} is unstable at p = {p} m, q = {q} rad: it would snap to another shape; "
                 "slow down or keep away from this pose",
@@ -158,6 +161,7 @@ class Plant:
             )
         drift = self._solver.drift()
         if not drift <= _LARGEST_DRIFT:
+            self._solver.go_back()
             raise ConvergenceError(
                 f"the rods at p = {p} m, q = {q} rad are too taut for this discretisation: their invariant drifts by "
                 f"{drift:.1e} (at most {_LARGEST_DRIFT:.0e}); use more segments or steps",

@@ -108,7 +108,9 @@ def rod_newton() -> tuple[Any, Any]:
     load_moves = ca.jacobian(loads, unknowns[:2]) @ moves + ca.jacobian(loads, pose)
     norm = ca.norm_2(residual)
     # The determinant is negative on the stable sheet, and its first zero is the limit of stability.
-    scalars = ca.vertcat(norm, ca.norm_2(step), energy, determinant >= 0, 0)
+    # It turns negative again at the second zero, which lies beyond this line for every tip angle.
+    beyond = ca.logic_or(determinant >= 0, load > 2 * (np.log(8.0) - unknowns[0]) + 5)
+    scalars = ca.vertcat(norm, ca.norm_2(step), energy, beyond, 0)
     results = [ca.vertcat(step, 0), ca.vertcat(moves, ca.SX(1, 3)), loads, load_moves, scalars]
     options = {"cse": True}
     newton = ca.Function("rod_newton", [unknowns, pose], [ca.densify(r) for r in results], options)
@@ -140,10 +142,9 @@ def nodes(unknowns: np.ndarray, angle: float, n_nodes: int) -> np.ndarray:
 
 @lru_cache
 def _determinants() -> Any:
-    unknowns, pose = ca.SX.sym("unknowns", 3), ca.DM.zeros(3)
-    newton, _ = rod_newton()
-    beyond = newton(unknowns, pose)[4][3]
-    return ca.Function("beyond", [unknowns], [beyond]).map(_SWEEP)
+    unknowns = ca.SX.sym("unknowns", 2)
+    jacobian = tip_map()(unknowns)[1]
+    return ca.Function("beyond", [unknowns], [ca.det(jacobian) >= 0]).map(_SWEEP)
 
 
 def conjugate_points(unknowns: np.ndarray) -> int:
@@ -155,7 +156,7 @@ def conjugate_points(unknowns: np.ndarray) -> int:
     first = max(5.7, np.log(8.0) - unknowns[0])
     if unknowns[1] <= first:
         return 0
-    columns = np.stack([np.full(_SWEEP, unknowns[0]), np.linspace(first, unknowns[1], _SWEEP), np.ones(_SWEEP)])
+    columns = np.stack([np.full(_SWEEP, unknowns[0]), np.linspace(first, unknowns[1], _SWEEP)])
     beyond = _determinants()(columns).full().ravel()
     return int(np.count_nonzero(np.diff(beyond)))
 

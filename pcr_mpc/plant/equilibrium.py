@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..frozen import freeze
 from .robot import Robot
 from .rod import sample_rod
 
@@ -72,9 +73,7 @@ class Equilibrium:
     converged: bool = True
 
     def __post_init__(self) -> None:
-        for value in self.__dict__.values():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
+        freeze(self)
 
     @cached_property
     def stiffness_eigenvalues(self) -> np.ndarray:

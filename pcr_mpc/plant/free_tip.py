@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
+from ..errors import ConvergenceError, PCRError, UnreachableError, UnstableError, checked_vector
 from .chart import held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
@@ -19,8 +19,10 @@ from .rod_solver import RodSolver
 _MAX_ITERATIONS = 100
 _FORCE_TOLERANCE = 1e-9  # of the robot's force scale, sum EI/L^2
 _ANGLE_STEP = 0.25  # largest motor step of a continuation [rad]
+_TIP_STEP = 0.05  # largest tip step of a continuation, in rod lengths
 _OFFSETS = np.linspace(-2.6, 2.6, 40)  # clamp angle minus chord angle, of a cold inverse start [rad]
 _CANDIDATES = 24
+_COMBINATIONS = 100_000
 
 
 def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equilibrium | None = None) -> Equilibrium:
@@ -98,7 +100,9 @@ def inverse_statics(
     Raises
     ------
     UnreachableError
-        If |p - base_i| >= L_i for some rod i.
+        If |p - base_i| >= L_i for some rod i, or the branch of the guess needs a motor beyond its stop.
+    UnstableError
+        The branch of the guess is not stable at p.
     ConvergenceError
         No stable pose of that mode was found within the motors' limits.
     """
@@ -106,8 +110,12 @@ def inverse_statics(
     robot.require_reachable(p)
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
+        if mode is not None:
+            raise ValueError("give either guess, whose branch is followed, or mode, for a search")
         solver.start(guess.p, guess.q, guess.nodes)
-        return solver.equilibrium(p, _reach(solver, guess, p, force))
+        eq = solver.equilibrium(p, _reach(solver, guess, p, force))
+        _require_usable(eq)
+        return eq
     if mode is not None and (len(mode) != robot.n_rods or set(mode) - set("LR")):
         raise ValueError(f"mode is {mode!r}, expected {robot.n_rods} letters L or R")
     found: list[Equilibrium] = []
@@ -186,9 +194,36 @@ def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -
     )
 
 
+def _require_usable(eq: Equilibrium) -> None:
+    """Raise if a pose that the motors should hold is unstable or beyond their stops."""
+    if not eq.stable:
+        raise UnstableError(
+            f"the branch leads to a pose at p = {eq.p} m, q = {eq.q} rad that is in balance but not stable: smallest "
+            f"stiffness {eq.stiffness_eigenvalues[0]:.4g} N/m, unstable rods {eq.unstable_rods}; choose a nearer tip "
+            "or another working mode",
+            eigenvalue=float(eq.stiffness_eigenvalues[0]),
+            rod=eq.unstable_rods,
+            p=eq.p,
+            q=eq.q,
+        )
+    lower, upper = eq.robot.angle_limits.T
+    outside = np.flatnonzero((eq.q < lower) | (eq.q > upper))
+    if outside.size:
+        i = int(outside[0])
+        raise UnreachableError(
+            f"p = {eq.p} m needs motor {i} at {eq.q[i]:.4f} rad, outside [{lower[i]:.4f}, {upper[i]:.4f}] rad; "
+            "choose a nearer tip or another working mode",
+            rod=i,
+            angle=float(eq.q[i]),
+            limits=(float(lower[i]), float(upper[i])),
+        )
+
+
 def _reach(solver: RodSolver, guess: Equilibrium, p: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Follow the branch of ``guess`` to (p, force), in sub-steps where one step fails."""
-    q, done, substep = guess.q, 0.0, 1.0
+    longest = _TIP_STEP * float(solver.robot.lengths.min())
+    q, done = guess.q, 0.0
+    largest = substep = min(1.0, longest / max(float(np.linalg.norm(p - guess.p)), longest))
     while done < 1.0:
         target = min(1.0, done + substep)
         try:
@@ -204,7 +239,7 @@ def _reach(solver: RodSolver, guess: Equilibrium, p: np.ndarray, force: np.ndarr
                     last=q,
                 ) from None
         else:
-            done, substep = target, 2 * substep
+            done, substep = target, min(2 * substep, largest)
     return q
 
 
@@ -262,13 +297,15 @@ def _tip_starts(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
 def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | None) -> list[np.ndarray]:
     """Motor angles within limits whose coarse shapes nearly carry ``force``, best first."""
     per_rod = []
+    # The coarser, the more rods there are to combine.
+    offsets = _OFFSETS[:: max(1, int(np.ceil(len(_OFFSETS) / _COMBINATIONS ** (1 / robot.n_rods))))]
     for i, rod in enumerate(robot.rods):
         dx, dy = (p - rod.base) / rod.length
         chord = np.arctan2(dy, dx)
         lower, upper = rod.angle_limits
         unit = rod.bending_stiffness / rod.length**2
         rows = []
-        for angle in chord + _OFFSETS:
+        for angle in chord + offsets:
             angle = lower + (angle - lower) % (2 * np.pi)
             if angle > upper:
                 continue
@@ -280,7 +317,7 @@ def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | No
         per_rod.append(rows)
     scored = []
     scale = _force_scale(robot)
-    for combination in itertools.islice(itertools.product(*per_rod), 200_000):
+    for combination in itertools.product(*per_rod):
         angles, n_x, n_y, energy = zip(*combination, strict=True)
         mismatch = np.hypot(sum(n_x) - force[0], sum(n_y) - force[1]) / scale
         scored.append((mismatch + 0.02 * sum(energy), angles))

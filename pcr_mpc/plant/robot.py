@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import ModelError, UnreachableError
+from ..frozen import read_only
 from ..toml_table import read_toml
 
 
@@ -80,22 +81,22 @@ class Robot:
     @cached_property
     def bases(self) -> np.ndarray:
         """Motor axes, shape (n, 2) [m]."""
-        return np.array([rod.base for rod in self.rods])
+        return read_only(np.array([rod.base for rod in self.rods]))
 
     @cached_property
     def lengths(self) -> np.ndarray:
         """Rod lengths, shape (n,) [m]."""
-        return np.array([rod.length for rod in self.rods])
+        return read_only(np.array([rod.length for rod in self.rods]))
 
     @cached_property
     def stiffnesses(self) -> np.ndarray:
         """Bending stiffnesses EI, shape (n,) [N m^2]."""
-        return np.array([rod.bending_stiffness for rod in self.rods])
+        return read_only(np.array([rod.bending_stiffness for rod in self.rods]))
 
     @cached_property
     def angle_limits(self) -> np.ndarray:
         """Least and greatest motor angles, shape (n, 2) [rad]."""
-        return np.array([rod.angle_limits for rod in self.rods])
+        return read_only(np.array([rod.angle_limits for rod in self.rods]))
 
     def require_reachable(self, p: np.ndarray) -> None:
         """Raise `UnreachableError` if some rod cannot reach ``p``, shape (2,) [m]."""

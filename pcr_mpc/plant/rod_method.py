@@ -54,7 +54,7 @@ class RodMethod:
     from_nodes : callable
         nodes (4, N) -> unknowns: a start from an equilibrium or a guess.
     to_nodes : callable
-        (unknowns, clamp angle) -> nodes (4, N).
+        (unknowns, clamp angle, wanted number N) -> nodes (4, N); the shooting methods keep their own number.
     """
 
     name: str
@@ -63,7 +63,7 @@ class RodMethod:
     branch: slice
     from_shape: Callable[[HeldShape, float], np.ndarray]
     from_nodes: Callable[[np.ndarray], np.ndarray]
-    to_nodes: Callable[[np.ndarray, float], np.ndarray]
+    to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
 
 
 @lru_cache
@@ -83,7 +83,7 @@ def shooting_method(shooting: Shooting) -> RodMethod:
         branch=slice(0, None, 4),
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
-        to_nodes=lambda unknowns, _: unknowns.reshape((4, n), order="F").copy(),
+        to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
     )
 
 
@@ -98,7 +98,7 @@ def closed_form_method() -> RodMethod:
         branch=slice(0, 2),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=elastica.from_nodes,
-        to_nodes=lambda unknowns, angle: elastica.nodes(unknowns, angle, 8),
+        to_nodes=elastica.nodes,
     )
 
 

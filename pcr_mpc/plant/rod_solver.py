@@ -9,6 +9,7 @@ import numpy as np
 
 from ..buffered import BufferedFunction
 from ..errors import ConvergenceError
+from ..frozen import read_only
 from .chart import held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
@@ -61,16 +62,16 @@ class _RobotState:
         self.unstable_rods = tuple(i for i, count in enumerate(self.scalars[3].tolist()) if count)
         units = robot.stiffnesses / robot.lengths**2
         moves = self.load_tangents[:2].reshape(2, -1, 3)
-        self.force: np.ndarray = self.loads[:2] @ units
-        self.k: np.ndarray = np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths)
-        self.g: np.ndarray = moves[:, :, 2] * units
+        self.force = read_only(self.loads[:2] @ units)
+        self.k = read_only(np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths))
+        self.g = read_only(moves[:, :, 2] * units)
 
     def take(self, outputs: list[np.ndarray], iterations: int) -> None:
         """Copy the results of `warm_step`, which found no conjugate point."""
         (self.unknowns[:], self.tangents[:], self.poses[:], self.loads[:], self.load_tangents[:],
          self.scalars[:]) = outputs[:6]  # fmt: skip
         self.residual, _, _, _, self.drift = outputs[6].tolist()
-        self.force, self.k, self.g = (output.copy() for output in outputs[7:])
+        self.force, self.k, self.g = (read_only(output.copy()) for output in outputs[7:])
         self.iterations = iterations
         self.unstable_rods = ()
 
@@ -113,6 +114,7 @@ class RodSolver:
         self._check = BufferedFunction(method.residual)
         self._warm = [BufferedFunction(warm_step(robot, method, iterations)) for iterations in (1, 2)]
         self._state: _RobotState | None = None
+        self._spare: _RobotState | None = None
         self._force_units = robot.stiffnesses / robot.lengths**2
         self._moment_units = robot.stiffnesses / robot.lengths
 
@@ -129,7 +131,7 @@ class RodSolver:
                 ]
             else:
                 rods = [self._cold(i, pose) for i, pose in enumerate(poses)]
-            self._state = _RobotState(self.robot, rods)
+            self._state, self._spare = _RobotState(self.robot, rods), _RobotState(self.robot, rods)
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
 
@@ -160,14 +162,21 @@ class RodSolver:
             warm()
             residual, rough, change, conjugate_points, _ = warm.outputs[6].tolist()
             if residual <= TOLERANCE and rough <= derivatives and change <= _BRANCH_CHANGE and not conjugate_points:
-                state.take(warm.outputs, 1 if warm is self._warm[0] else 2)
+                # Into the spare one: the last state stays whole for a caller who goes back to it.
+                assert self._spare is not None
+                self._spare.take(warm.outputs, 1 if warm is self._warm[0] else 2)
+                self._state, self._spare = self._spare, state
                 return
         rods, poses = state.rods(), self._poses(p, q)
         try:
             rods = [self._follow(i, rods[i], pose, derivatives, continuation) for i, pose in enumerate(poses)]
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
-        self._state = _RobotState(self.robot, rods)
+        self._state, self._spare = _RobotState(self.robot, rods), state
+
+    def go_back(self) -> None:
+        """Undo the last `move`."""
+        self._state, self._spare = self._spare, self._state
 
     def force(self) -> np.ndarray:
         """F = sum n_i = dU/dp at the last pose, shape (2,) [N]."""
@@ -194,7 +203,12 @@ class RodSolver:
         """Everything about the last pose, which was solved at (p, q)."""
         state = self._started()
         k, g = self.jacobians()
-        nodes = [self.method.to_nodes(u, pose[2]) for u, pose in zip(state.unknowns.T, state.poses.T, strict=True)]
+        # Nodes at most 4 / lambda apart, so that integrating between them is stable on taut rods.
+        load = math.sqrt(float(np.hypot(*state.loads[:2]).max()))
+        n_nodes = max(8, 2 ** math.ceil(math.log2(max(load, 1.0) / 4.0)))
+        nodes = [
+            self.method.to_nodes(u, pose[2], n_nodes) for u, pose in zip(state.unknowns.T, state.poses.T, strict=True)
+        ]
         return Equilibrium(
             robot=self.robot,
             p=np.array(p),

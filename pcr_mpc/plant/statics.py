@@ -42,16 +42,16 @@ def solve_statics(
         Tip position in the world frame [m].
     q : array_like, shape (n,)
         Motor angles, counter-clockwise from world x [rad].
-    method : {"multiple_shooting", "single_shooting"}
-        Paper sec. 4, or the baseline of sec. 2, which uses segments * steps integration steps.
+    method : {"closed_form", "multiple_shooting", "single_shooting"}
+        Exact; paper sec. 4; or the baseline of sec. 2, which uses segments * steps integration steps.
     segments : int
         Shooting segments per rod (N).
     steps : int, optional
         Runge-Kutta steps per segment. None: as many steps of order 8 as bring the drift of the invariant below
         1e-6 (mostly one, with 1e-7 relative error of F), up to 12 for taut rods.
     scheme : {"rk4", "rk8"}
-        Runge-Kutta scheme, where steps are given: the paper's, or order 8, whose single step per segment is as
-        fast as four of RK4 and a hundred times more accurate.
+        Runge-Kutta scheme where steps are given (else order 8): the paper's, or order 8, whose single step per
+        segment is as fast as four of RK4 and a hundred times more accurate.
     guess : Equilibrium or ndarray, optional
         An equilibrium of this robot, whose branch is followed to (p, q); or nodes of shape (n, 4, N) from
         which to iterate (see `Equilibrium.nodes`). None: each rod takes its stable shape of least energy.
@@ -77,9 +77,9 @@ def solve_statics(
     """
     p, q = checked_vector("p", p, 2), checked_vector("q", q, robot.n_rods)
     robot.require_reachable(p)
+    shooting = checked_shooting(segments, 1 if steps is None else steps, scheme)
     if steps is None and method != "closed_form":
         return _refined(robot, p, q, method, segments, guess)
-    shooting = checked_shooting(segments, steps or 1, scheme)
     solver = _solver(robot, method, shooting, threading.get_ident())
     if isinstance(guess, Equilibrium):
         solver.start(guess.p, guess.q, _of(robot, guess).nodes)

@@ -1,53 +1,24 @@
-"""The linear model that a controller predicts with: x+ = A x + B u + c."""
+"""From the plant to the linear model."""
 
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
-import control
 import numpy as np
 
 from ..buffered import BufferedFunction
 from ..errors import checked_vector
 from ..plant.dynamics import Plant
+from .linear_model import LinearModel
 
-# Taylor order and squarings of the matrix exponential: 1e-11 at K dt^2/m = 4, rounding below 1.
-_TAYLOR_ORDER, _SQUARINGS = 8, 4
+# Taylor order and squarings of the matrix exponential: better than 1e-9 up to K dt^2/m = 1000.
+_TAYLOR_ORDER, _SQUARINGS = 8, 6
+_STIFFEST = 1e3
 # Residual of the statics at which K and G may be taken; their error is of this size.
 _DERIVATIVE_ACCURACY = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class LinearModel:
-    """Affine discrete-time model x+ = A x + B u + c with x = [p, v, q] and u held over dt.
-
-    Attributes
-    ----------
-    A : ndarray, shape (4 + n, 4 + n)
-    B : ndarray, shape (4 + n, n)
-    c : ndarray, shape (4 + n,)
-    dt : float
-        Period [s].
-    """
-
-    A: np.ndarray
-    B: np.ndarray
-    c: np.ndarray
-    dt: float
-
-    def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Predict the next state."""
-        return np.asarray(self.A @ x + self.B @ u + self.c)
-
-    def to_control(self) -> Any:
-        """Return the linear part as a `control.StateSpace` with the tip position as output."""
-        n_states, n_inputs = self.B.shape
-        output = np.eye(2, n_states)
-        return control.ss(self.A, self.B, output, np.zeros((2, n_inputs)), self.dt)
 
 
 def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) -> LinearModel:
@@ -74,11 +45,21 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     ------
     UnreachableError, ConvergenceError, UnstableError
         As `Plant.step`.
+    ValueError
+        dt is not positive, or so long that K dt^2/m exceeds 1000.
     """
     x = checked_vector("x", x, plant.n_states)
     checked_vector("u", u, plant.robot.n_rods)
     f_ext = checked_vector("f_ext", f_ext, 2)
+    if not 0.0 < dt < np.inf:
+        raise ValueError(f"dt is {dt} s, expected a positive number")
     force, k, g = plant.force_and_jacobians(x[:2], x[4:], _DERIVATIVE_ACCURACY)
+    stiffness = float(np.abs(k).max()) * dt * dt / plant.robot.tip_mass
+    if stiffness > _STIFFEST:
+        raise ValueError(
+            f"dt = {dt} s is too long for the stiffness at p = {x[:2]} m: K dt^2/m is {stiffness:.3g}, at most "
+            f"{_STIFFEST:g}; shorten the period or keep away from taut rods"
+        )
     function = _discretisation(plant.robot.n_rods, threading.get_ident())
     function.inputs[0][:] = k
     function.inputs[1][:] = g

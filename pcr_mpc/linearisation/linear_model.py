@@ -1,0 +1,43 @@
+"""The linear model that a controller predicts with: x+ = A x + B u + c."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import control
+import numpy as np
+
+from ..frozen import freeze
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """Affine discrete-time model x+ = A x + B u + c with x = [p, v, q] and u held over dt.
+
+    Attributes
+    ----------
+    A : ndarray, shape (4 + n, 4 + n)
+    B : ndarray, shape (4 + n, n)
+    c : ndarray, shape (4 + n,)
+    dt : float
+        Period [s].
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    c: np.ndarray
+    dt: float
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Predict the next state."""
+        return np.asarray(self.A @ x + self.B @ u + self.c)
+
+    def to_control(self) -> Any:
+        """Return the linear part as a `control.StateSpace` with the tip position as output."""
+        n_states, n_inputs = self.B.shape
+        output = np.eye(2, n_states)
+        return control.ss(self.A, self.B, output, np.zeros((2, n_inputs)), self.dt)
