@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         status: int = options.run(options)
         return status
-    except (PCRError, ValueError, OSError) as error:
+    except (PCRError, ValueError, OSError, MemoryError) as error:
         if options.traceback:
             traceback.print_exc()
         print(f"pcr-mpc: {error}", file=sys.stderr)
@@ -87,10 +87,10 @@ def _parser() -> argparse.ArgumentParser:
     statics.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), help="tip position [m]")
     statics.add_argument("--q", type=float, nargs="+", metavar="A", help="motor angles [rad]")
     statics.add_argument("--degrees", action="store_true", help="motor angles are given in degrees")
-    statics.add_argument("--force", type=float, nargs=2, default=(0.0, 0.0), metavar=("FX", "FY"),
+    statics.add_argument("--force", type=float, nargs=2, metavar=("FX", "FY"),
                          help="external force on the tip [N], where p or q is to be found (default 0 0)")  # fmt: skip
     statics.add_argument("--mode", help="working mode to look for, a letter L or R per rod, such as LR")
-    statics.add_argument("--method", choices=METHODS, default="closed_form", help="where both p and q are given")
+    statics.add_argument("--method", choices=METHODS, help="where both p and q are given (default closed_form)")
     statics.add_argument(
         "--equilibria",
         action="store_true",
@@ -108,12 +108,15 @@ def _parser() -> argparse.ArgumentParser:
 def _track(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     tuning = load_tuning(options.controller) if options.controller else None
+    if tuning and scene.trajectory is None:
+        raise ValueError(f"scene {scene.name} has nothing to track, so --controller has no use")
     plant = scene.make_plant()
     if options.method:
         settings = scene.plant
         plant = Plant(scene.robot, method=options.method, segments=settings.segments, steps=settings.steps,
                       scheme=settings.scheme, integrator=settings.integrator, dt=settings.dt)  # fmt: skip
     folder = options.out or Path("results") / scene.name
+    folder.mkdir(parents=True, exist_ok=True)  # rather now than after the run
     failure: SimulationError | None = None
     try:
         run = simulate(scene, plant, make_controller(scene, tuning), options.seed, progress=True)
@@ -140,14 +143,21 @@ def _pictures(run: Run, folder: Path) -> dict[str, str]:
 def _statics(options: argparse.Namespace) -> int:
     robot = load_robot(options.robot)
     q = options.q
+    if options.method and (options.p is None or q is None):
+        raise ValueError("--method goes with both --p and --q")
+    if options.mode and (options.p is None or q is not None):
+        raise ValueError("--mode goes with --p alone")
+    if options.force is not None and options.p is not None and q is not None:
+        raise ValueError("--force goes with --p alone or --q alone")
+    force = options.force or (0.0, 0.0)
     if q is not None and options.degrees:
         q = [math.radians(angle) for angle in q]
     if options.p is not None and q is not None:
-        eq = solve_statics(robot, options.p, q, method=options.method)
+        eq = solve_statics(robot, options.p, q, method=options.method or "closed_form")
     elif options.p is not None:
-        eq = inverse_statics(robot, options.p, options.force, mode=options.mode)
+        eq = inverse_statics(robot, options.p, force, mode=options.mode)
     elif q is not None:
-        eq = forward_statics(robot, q, options.force)
+        eq = forward_statics(robot, q, force)
     else:
         raise ValueError("give --p, --q or both")
     if options.equilibria:
@@ -159,7 +169,7 @@ def _statics(options: argparse.Namespace) -> int:
 
 
 def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:
-    found = all_equilibria(eq.robot, None if options.p is None else eq.p, eq.q, options.force)
+    found = all_equilibria(eq.robot, None if options.p is None else eq.p, eq.q, options.force or (0.0, 0.0))
     if options.json:
         records = [
             {**equilibrium_record(one), "unstable_directions": assess_stability(one).unstable_directions}
@@ -184,8 +194,10 @@ def _timing(options: argparse.Namespace) -> int:
         print(json.dumps(result))
         return 0
     budgets = {"plant step": 1e6 * scene.plant.dt, "control step": 1e6 * scene.period}
+    errors = [f"{c['method']} {c['force_error']:.1e}" for c in result["components"] if "force_error" in c]
     rows = [(f"{c['name']} ({c['method']})", c, budgets.get(c["name"])) for c in result["components"]]
     print(f"\n{scene.name}\n\n{times_table(rows)}\n")
+    print(f"relative error of F along the run: {', '.join(errors)}")
     print(", ".join(f"{name} {value}" for name, value in {**result["machine"], **result["versions"]}.items()))
     return 0
 

@@ -87,7 +87,7 @@ class Table:
         if (
             not isinstance(value, list)
             or (size is not None and len(value) != size)
-            or not all(isinstance(v, int | float) and math.isfinite(v) for v in value)
+            or not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
         ):
             count = "" if size is None else f"{size} "
             raise self.fail(key, f"expected a list of {count}finite numbers, found {value!r}")

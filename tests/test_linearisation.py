@@ -24,7 +24,7 @@ def test_jacobians_against_central_differences(pair, poses, method):
         assert errors[0] > 10 * errors.min()  # rounding
 
 
-@pytest.mark.parametrize("dt", [1e-3, 1e-2, 1e-1])
+@pytest.mark.parametrize("dt", [1e-3, 1e-2, 1e-1, 0.3])
 def test_discretisation_is_exact(pair, poses, dt):
     """Against SciPy's matrix exponential of the whole affine system."""
     plant = Plant(pair)
@@ -64,6 +64,14 @@ def test_prediction_error_is_of_second_order(pair, centre):
         errors.append(np.linalg.norm(predicted - y))
     rates = np.log2(np.array(errors[:-1]) / errors[1:])
     assert rates == pytest.approx([2.0, 2.0], abs=0.2)
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0, np.nan, np.inf, 100.0])
+def test_a_senseless_period_is_refused(pair, centre, dt):
+    plant = Plant(pair)
+    plant.reset(state(centre), centre)
+    with pytest.raises(ValueError, match="dt"):
+        linearise(plant, state(centre), (0.0, 0.0), dt)
 
 
 def test_state_space(pair, centre):

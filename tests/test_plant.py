@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pcr_mpc import PCRError, Plant, UnreachableError, load_robot
+from pcr_mpc import ConvergenceError, PCRError, Plant, UnreachableError, load_robot
 from pcr_mpc.plant.dynamics import INTEGRATORS
 
 from .conftest import MODELS
@@ -138,6 +138,27 @@ def test_large_steps_stay_on_the_branch(pair, centre):
     assert plant.equilibrium(np.concatenate([far, [0, 0], centre.q])).mode == "LR"
     assert plant.force(centre.p, centre.q) == pytest.approx([0, 0], abs=1e-8)
     assert plant.force(far, centre.q) == pytest.approx(force, abs=1e-8)
+
+
+def test_too_coarse_a_discretisation_is_refused(pair, centre):
+    plant = Plant(pair, method="multiple_shooting", segments=2, steps=1, scheme="rk4")
+    with pytest.raises(ConvergenceError, match="too taut for this discretisation"):
+        plant.reset(start(centre), centre)
+
+
+def test_a_motor_beyond_its_stop_comes_back_at_its_rate(pair, centre):
+    plant = Plant(pair, dt=1e-3)
+    x = start(centre)
+    x[5] = pair.angle_limits[1, 1] + 0.1
+    plant.reset(x)
+    assert plant.step(x, (0.0, 0.0))[5] == pytest.approx(x[5] - 6e-3)
+
+
+def test_forces_are_read_only(pair, centre):
+    plant = Plant(pair)
+    plant.reset(start(centre), centre)
+    with pytest.raises(ValueError, match="read-only"):
+        plant.force(centre.p, centre.q)[0] = 1.0
 
 
 def test_bad_arguments_are_named(pair, centre):

@@ -109,8 +109,8 @@ def test_constraints_are_rates_changes_and_angles(model, centre, tuning, limits)
     for u in inputs:
         state = model(state, u)
         angles.append(state[4:])
-    assert rows[2] - upper[2] == pytest.approx(np.array(angles) - limits.angle_upper)
-    assert rows[2] - lower[2] == pytest.approx(np.array(angles) - limits.angle_lower)
+    assert DT * (rows[2] - upper[2]) == pytest.approx(np.array(angles) - limits.angle_upper)
+    assert DT * (rows[2] - lower[2]) == pytest.approx(np.array(angles) - limits.angle_lower)
 
 
 def test_without_active_limits_the_mpc_is_the_lqr(model, centre, tuning, pair):

@@ -6,6 +6,8 @@ import pytest
 
 from pcr_mpc import (
     HoldMotors,
+    ModelError,
+    Plant,
     SimulationError,
     UnreachableError,
     load_scene,
@@ -58,9 +60,17 @@ def test_the_rate_limit_is_reached_and_held():
 
 def test_violations_are_counted(run):
     assert replace(run, u=run.u + 7.0).limit_violations() == len(run.u)
+    # A command that leads beyond the stop counts, although the motor stays at it.
     x = run.x.copy()
-    x[-1, 4] = 9.0
-    assert replace(run, x=x).limit_violations() == 1
+    x[1000, 4] = run.scene.robot.angle_limits[0, 1]
+    u = run.u.copy()
+    u[100, 0] = 0.5
+    assert replace(run, x=x, u=u).limit_violations() == 1
+
+
+def test_peak_torque_is_that_of_the_statics(run, pair):
+    # The centre pose takes 0.76 N m; the figure of eight takes more, within the limit.
+    assert 0.76 < run.peak_torque() < pair.torque_limit
 
 
 def test_controllers_plan_and_plant_are_separate_objects(lemniscate):
@@ -114,13 +124,6 @@ def test_an_unknown_load_leaves_an_offset():
 def test_a_failing_run_keeps_what_it_had(lemniscate, tmp_path):
     scene = replace(lemniscate, duration=0.5)
 
-    class Broken(HoldMotors):
-        name = "broken"
-
-        def step(self, k, x):
-            decision = super().step(k, x)
-            return replace(decision, u=np.full(2, np.nan)) if k == 20 else decision
-
     class Kicked:
         """A plant that throws the tip out of reach at the 100th step."""
 
@@ -146,6 +149,31 @@ def test_a_failing_run_keeps_what_it_had(lemniscate, tmp_path):
     files = run.save(tmp_path)
     assert json.loads((tmp_path / "summary.json").read_text())["events"][0]["kind"] == "failure"
     assert len(np.load(files["run.npz"])["t"]) == len(run.t)
+
+
+def test_a_nan_command_keeps_the_run_so_far(lemniscate):
+    class Broken(HoldMotors):
+        def step(self, k, x):
+            decision = super().step(k, x)
+            return replace(decision, u=np.full(2, np.nan)) if k == 20 else decision
+
+    with pytest.raises(SimulationError, match="u is not finite") as caught:
+        simulate(lemniscate, lemniscate.make_plant(), Broken(2))
+    assert len(caught.value.run.t) == 201
+
+
+def test_a_finer_plant_than_the_scenes(lemniscate, tmp_path):
+    scene = replace(lemniscate, duration=0.3)
+    run = simulate(scene, Plant(scene.robot, integrator="velocity_verlet", dt=5e-4), make_controller(scene))
+    assert run.summary()["plant_budget_us"] == pytest.approx(500.0)
+    rows = np.genfromtxt(run.save(tmp_path)["run.csv"], delimiter=",", names=True)
+    assert rows["u0_rad_s"][400] == pytest.approx(run.u[20, 0], rel=1e-6)
+
+
+def test_motors_that_start_elsewhere_than_the_reference(lemniscate, centre):
+    scene = replace(lemniscate, start_tip=None, start_mode=None, start_motors=tuple(centre.q))
+    with pytest.raises(ModelError, match="free tip rests at"):
+        scene.start()
 
 
 def test_an_interrupted_run_keeps_what_it_had(lemniscate):
@@ -181,9 +209,9 @@ def test_fallbacks_are_counted(lemniscate):
 
         def step(self, k, x):
             if k == 1:
-                solver = controller.mpc._rates_only
-                solver._settings["max_iter"] = 1
-                solver.reset()
+                for solver in (controller.mpc._workspace.rates_only, controller.mpc._workspace.complete):
+                    solver._settings["max_iter"] = 1
+                    solver.reset()
             return controller.step(k, x)
 
     run = simulate(scene, scene.make_plant(), Starved())

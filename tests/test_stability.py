@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
 
-from pcr_mpc import Plant, UnreachableError, all_equilibria, assess_stability, distance_to_fold, solve_statics
+from pcr_mpc import (
+    Plant,
+    UnreachableError,
+    UnstableError,
+    all_equilibria,
+    assess_stability,
+    distance_to_fold,
+    inverse_statics,
+    solve_statics,
+)
 from pcr_mpc.plant import elastica
 from pcr_mpc.plant.chart import critical_load, stable_shapes
 from pcr_mpc.plant.multiple_shooting import rod_newton
@@ -132,6 +141,52 @@ def test_a_stable_pose_returns_and_an_unstable_one_leaves(pair, free):
             if np.linalg.norm(x[:2] - eq.p) > 1e-3:
                 break
         assert (np.linalg.norm(x[:2] - eq.p) < 1e-4) == eq.stable
+
+
+def test_an_unstable_balance_is_refused(pair, free):
+    """Near a saddle of the energy the motors can balance the tip, but not hold it."""
+    saddle = next(eq for eq in free if not eq.stable)
+    with pytest.raises(UnstableError, match="not stable") as caught:
+        inverse_statics(pair, saddle.p + [1e-3, 0.0], guess=saddle)
+    assert caught.value.eigenvalue == pytest.approx(saddle.stiffness_eigenvalues[0], rel=0.1)
+
+
+@pytest.mark.parametrize("load", [7.2, 11.0])
+def test_a_rod_beyond_its_limit_is_told_by_every_method(pair, load):
+    """k = 0.6: lambda_c is 6.7, and at 11 the determinant has changed its sign twice."""
+    nodes = elastica.nodes(np.array([np.log(2 * np.arccos(0.6)), load, 1.0]), 0.0, 8)
+    p = pair.rods[0].base + pair.rods[0].length * sample_rod(nodes, 2)[:2, -1]
+    # The other rod takes any stable shape.
+    other = np.arctan2(*(p - pair.rods[1].base)[::-1]) + 0.5
+    gentle = solve_statics(pair, p, (0.5, other)).nodes[1]
+    guess = np.stack([nodes, sample_rod(gentle, 9)[2:, :8]])
+    for method in ("closed_form", "multiple_shooting", "single_shooting"):
+        eq = solve_statics(pair, p, (0.0, other), method=method, guess=guess)
+        assert eq.unstable_rods == (0,), method
+        assert not eq.stable
+        assert assess_stability(eq).rod_margins[0] < 0
+        assert assess_stability(eq).unstable_directions >= (1 if load < 10 else 2)
+
+
+@pytest.mark.parametrize("method", ["closed_form", "multiple_shooting"])
+@pytest.mark.parametrize("turn", [4.4, -4.0])
+@pytest.mark.parametrize("steps", [1, 7, 60])
+def test_the_plant_never_walks_through_a_fold(pair, centre, method, turn, steps):
+    """Wind one motor up until its rod would snap, in steps of any size: an error, and the plant is as it was."""
+    plant = Plant(pair, method=method)
+    x = np.concatenate([centre.p, [0, 0], centre.q])
+    plant.reset(x, centre)
+    before = plant.force(centre.p + [0.01, 0], centre.q)
+
+    def wind_up():
+        for angle in np.linspace(0.0, turn, steps + 1)[1:]:
+            plant.force(centre.p, centre.q + [angle, 0.0])
+
+    with pytest.raises(UnstableError, match="snap") as caught:
+        wind_up()
+    assert caught.value.rod in (0, (0,))
+    if steps == 1:
+        assert plant.force(centre.p + [0.01, 0], centre.q) == pytest.approx(before, abs=1e-9)
 
 
 def test_distance_to_fold(pair, centre):

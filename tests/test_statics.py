@@ -200,6 +200,28 @@ def test_taut_rods_are_refined_or_refused(pair):
         solve_statics(pair, p, q, method="multiple_shooting", segments=1)
 
 
+def test_taut_rods_are_drawn_to_their_tips(rfrfr):
+    """Stretch 0.98: nodes close enough together that the centreline does not run away."""
+    eq = solve_statics(rfrfr, (-0.78, 0.044), (-4.735, 0.577))
+    assert eq.shape()[:, -1] == pytest.approx(np.tile(eq.p, (2, 1)), abs=1e-7)
+
+
+def test_inverse_statics_keeps_to_stops_and_modes(pair, centre):
+    with pytest.raises(UnreachableError, match="outside") as caught:
+        inverse_statics(pair, (-0.2, 0.1), guess=centre)
+    assert caught.value.angle > caught.value.limits[1]
+    with pytest.raises(ValueError, match="either guess"):
+        inverse_statics(pair, (0.01, 0.25), guess=centre, mode="RL")
+
+
+def test_a_guess_of_another_robot_is_named(pair, centre):
+    other = inverse_statics(load_robot(MODELS / "three_rods.toml"), (0.0, 0.115), mode="LLL")
+    with pytest.raises(ValueError, match=r"expected \(2, 4, N\)"):
+        inverse_statics(pair, (0.0, 0.25), guess=other)
+    with pytest.raises(ValueError, match="guess has 3 rods"):
+        solve_statics(pair, (0.0, 0.25), centre.q, guess=other)
+
+
 def test_equilibria_are_frozen(centre):
     with pytest.raises(ValueError, match="read-only"):
         centre.force[0] = 1.0

@@ -11,6 +11,7 @@ import control
 import numpy as np
 
 from ..errors import InfeasibleError
+from ..frozen import freeze
 from ..linearisation.linear_model import LinearModel
 from .osqp_solver import QPSolver, Solution
 from .qp import QuadraticProgram, Reference, build_qp, constraint_matrix
@@ -52,6 +53,9 @@ class Plan:
     update_time: float
     solve_time: float
 
+    def __post_init__(self) -> None:
+        freeze(self)
+
     @cached_property
     def states(self) -> np.ndarray:
         """Predicted states, the current one first, shape (N + 1, 4 + n)."""
@@ -76,9 +80,7 @@ class LinearMPC:
     def __init__(self, tuning: Tuning, limits: Limits) -> None:
         self.tuning = tuning
         self.limits = limits
-        self._rates_only: QPSolver | None = None
-        self._solver: QPSolver | None = None
-        self._dense = np.empty((0, 0))
+        self._workspace: _Workspace | None = None
         self._terminal_weight: np.ndarray | None = None
         self._last: Plan | None = None
 
@@ -86,9 +88,15 @@ class LinearMPC:
         """Start afresh: the same calls then give the same plans, bit for bit."""
         self._last = None
         self._terminal_weight = None
-        for solver in (self._rates_only, self._solver):
-            if solver is not None:
-                solver.reset()
+        if self._workspace is not None:
+            self._workspace.rates_only.reset()
+            self._workspace.complete.reset()
+
+    def prepare(self, model: LinearModel) -> None:
+        """Take the terminal weight from ``model`` and build the solvers; else the first `solve` does it."""
+        self._terminal_weight = terminal_weight(model, self.tuning)
+        if self._workspace is None:
+            self._workspace = _Workspace(self.tuning, model)
 
     def solve(
         self,
@@ -118,29 +126,23 @@ class LinearMPC:
         began = time.perf_counter()
         first = models if isinstance(models, LinearModel) else models[0]
         n = first.B.shape[1]
-        if self._terminal_weight is None:
-            self._terminal_weight = terminal_weight(first, self.tuning)
-        if self._solver is None or self._rates_only is None:
-            matrix = constraint_matrix(self.tuning.horizon, n, first.dt)
-            settings = self.tuning.tolerance, self.tuning.max_iterations
-            self._dense = matrix.toarray()
-            self._solver = QPSolver(matrix, *settings)
-            self._rates_only = QPSolver(matrix[: matrix.shape[1]].tocsc(), *settings)
+        if self._terminal_weight is None or self._workspace is None:
+            self.prepare(first)
+        assert self._terminal_weight is not None
+        assert self._workspace is not None
+        self._workspace.require(first)
         qp = build_qp(x, models, reference, u_previous, self.tuning, self.limits, self._terminal_weight)
         warm = None if self._last is None else _shifted(self._last.inputs).ravel()
         updated = time.perf_counter()
         try:
-            solution = self._solve(qp, self._rates_only, self._solver, warm)
+            solution = self._workspace.solve(qp, warm)
         except InfeasibleError as error:
-            self._last = self._fall_back(error, x, models, time.perf_counter() - began)
+            spent = updated - began, time.perf_counter() - updated
+            self._last = self._fall_back(error, x, models, u_previous, spent)
             return self._last
         solved = time.perf_counter()
         inputs = solution.x.reshape(-1, n)
-        # OSQP meets bounds to its tolerance; what is applied meets them exactly.
-        first_change = n * len(inputs)
-        lower = np.maximum(qp.l[:n], qp.l[first_change : first_change + n])
-        upper = np.minimum(qp.u[:n], qp.u[first_change : first_change + n])
-        inputs[0] = np.minimum(np.maximum(inputs[0], lower), upper)
+        inputs[0] = self._clipped(inputs[0], u_previous)
         self._last = Plan(
             inputs=inputs,
             x=x.copy(),
@@ -155,34 +157,28 @@ class LinearMPC:
         )
         return self._last
 
-    def _solve(
-        self, qp: QuadraticProgram, rates_only: QPSolver, complete: QPSolver, warm: np.ndarray | None
-    ) -> Solution:
-        """Solve with the rates' rows alone; where that breaks another row, with all of them.
-
-        An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half.
-        """
-        n_rates = rates_only.m
-        rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
-        if warm is not None:
-            rates_only.warm_start(warm)
-        solution = rates_only.solve()
-        rows = self._dense @ solution.x
-        broken = max(float((qp.l - rows).max()), float((rows - qp.u).max()), 0.0)
-        if broken <= self.tuning.tolerance:
-            return Solution(solution.x, solution.y, solution.iterations, broken, solution.dual_residual)
-        complete.update(qp.P, qp.q, qp.l, qp.u)
-        complete.warm_start(solution.x)
-        return complete.solve()
+    def _clipped(self, u: np.ndarray, u_previous: np.ndarray) -> np.ndarray:
+        """Meet the limits on rate and change exactly; OSQP meets them to its tolerance."""
+        rate, change = self.limits.rate, self.limits.rate_change
+        within = np.minimum(np.maximum(u, u_previous - change), u_previous + change)
+        return np.asarray(np.minimum(np.maximum(within, -rate), rate))
 
     def _fall_back(
-        self, error: InfeasibleError, x: np.ndarray, models: LinearModel | Sequence[LinearModel], spent: float
+        self,
+        error: InfeasibleError,
+        x: np.ndarray,
+        models: LinearModel | Sequence[LinearModel],
+        u_previous: np.ndarray,
+        spent: tuple[float, float],
     ) -> Plan:
         if self.tuning.fallback == "raise" or self._last is None:
             raise error
-        return replace(
-            self._last,
-            inputs=_shifted(self._last.inputs),
+        # The plan moved on by one period; past its end the motors come to rest.
+        inputs = _shifted(self._last.inputs)
+        inputs[-1] = self._clipped(np.zeros(inputs.shape[1]), inputs[-1])
+        inputs[0] = self._clipped(inputs[0], u_previous)
+        return Plan(
+            inputs=inputs,
             x=x.copy(),
             models=models,
             status=error.status,
@@ -190,16 +186,62 @@ class LinearMPC:
             iterations=error.details.get("iterations", 0),
             primal_residual=np.nan,
             dual_residual=np.nan,
-            update_time=spent,
-            solve_time=0.0,
+            update_time=spent[0],
+            solve_time=spent[1],
         )
+
+
+class _Workspace:
+    """Two solvers for the same problem: one that knows the limits on the rates alone, and one that knows all."""
+
+    def __init__(self, tuning: Tuning, model: LinearModel) -> None:
+        self.n, self.dt = model.B.shape[1], model.dt
+        self._tolerance = tuning.tolerance
+        matrix = constraint_matrix(tuning.horizon, self.n)
+        self._dense = matrix.toarray()
+        self.complete = QPSolver(matrix, tuning.tolerance, tuning.max_iterations)
+        self.rates_only = QPSolver(matrix[: matrix.shape[1]].tocsc(), tuning.tolerance, tuning.max_iterations)
+
+    def require(self, model: LinearModel) -> None:
+        """Raise if the model is for another robot or period."""
+        if (model.B.shape[1], model.dt) != (self.n, self.dt):
+            raise ValueError(
+                f"model has {model.B.shape[1]} motors and dt = {model.dt} s, but this controller was built for "
+                f"{self.n} and {self.dt} s; make a new one"
+            )
+
+    def solve(self, qp: QuadraticProgram, warm: np.ndarray | None) -> Solution:
+        """Solve with the rates' rows alone; where that breaks another row, or fails, with all of them.
+
+        An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half.
+        """
+        n_rates, spent = self.rates_only.m, 0
+        try:
+            self.rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
+            if warm is not None:
+                self.rates_only.warm_start(warm)
+            solution = self.rates_only.solve()
+        except InfeasibleError as error:
+            spent = error.details.get("iterations", 0)
+        else:
+            rows = self._dense @ solution.x
+            broken = max(float((qp.l - rows).max()), float((rows - qp.u).max()), 0.0)
+            if broken <= self._tolerance:
+                y = np.concatenate([solution.y, np.zeros(len(rows) - n_rates)])
+                return Solution(solution.x, y, solution.iterations, broken, solution.dual_residual)
+            spent, warm = solution.iterations, solution.x
+        self.complete.update(qp.P, qp.q, qp.l, qp.u)
+        if warm is not None:
+            self.complete.warm_start(warm)
+        solution = self.complete.solve()
+        return replace(solution, iterations=spent + solution.iterations)
 
 
 def terminal_weight(model: LinearModel, tuning: Tuning) -> np.ndarray:
     """Cost-to-go of the unconstrained LQR with the tuning's weights, shape (4 + n, 4 + n)."""
     n_states, n = model.B.shape
     # A little weight on the angles keeps the Riccati equation solvable where the tip does not see them all
-    # (more than two motors), and changes nothing else.
+    # (more than two motors), and changes the gains by less than 0.1 %.
     angle = max(tuning.angle_weight, 1e-6 * tuning.position_weight)
     stage = np.diag([tuning.position_weight] * 2 + [tuning.velocity_weight] * 2 + [angle] * (n_states - 4))
     _, cost, _ = control.dlqr(model.A, model.B, stage, tuning.input_weight * np.eye(n))

@@ -104,9 +104,9 @@ class QPSolver:
         Raises
         ------
         ValueError
-            Wrong shape or type, an entry that is not finite, or l > u; the old data then stay.
+            Wrong shape or type, or an entry that is not finite; the old data then stay.
         InfeasibleError
-            Some bounds cross; ``limit`` is the row.
+            Some bounds cross; ``limit`` is the row. The old data stay.
         """
         P, q = self._checked("P", P, self._n_hessian), self._checked("q", q, self.n)
         l, u = self._checked("l", l, self.m, bound=True), self._checked("u", u, self.m, bound=True)  # noqa: E741
@@ -129,13 +129,17 @@ class QPSolver:
         Raises
         ------
         InfeasibleError
-            OSQP's status is anything but "solved"; ``status`` says what, ``iterations`` how far it got.
+            OSQP's status is anything but "solved"; ``status`` says what, ``iterations`` how far it got, ``limit``
+            which row stands most in the way if the problem is infeasible.
         """
         core = self._osqp._solver
         core.solve()
         info = core.info
         if info.status_val != osqp.SolverStatus.OSQP_SOLVED:
-            status, iterations = info.status, int(info.iter)
+            status, iterations, limit = info.status, int(info.iter), None
+            if info.status_val == osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE:
+                # The row that weighs most in the proof that no point meets all bounds.
+                limit = int(np.argmax(np.abs(core.solution.prim_inf_cert)))
             # An unsolved problem's iterate and step size must not start the next one.
             self._require(self._osqp.warm_start(np.zeros(self.n), np.zeros(self.m)), "warm_start")
             self._osqp.update_settings(rho=_RHO)
@@ -144,7 +148,7 @@ class QPSolver:
                 "relax the limits, shorten the horizon or raise max_iterations",
                 status=status,
                 iterations=iterations,
-                limit=None,
+                limit=limit,
             )
         x, y = np.array(core.solution.x), np.array(core.solution.y)
         primal, dual = self._residuals(x, y)

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..buffered import BufferedFunction
+from ..frozen import read_only
 from ..linearisation.linear_model import LinearModel
 from .tuning import Limits, Tuning
 
@@ -43,7 +44,8 @@ class QuadraticProgram:
         Upper triangle of the Hessian, column by column.
     q : ndarray, shape (Nn,)
     A : scipy.sparse.csc_matrix, shape (3 N n, N n)
-        Rows: rates, changes of rate, angles. The motors integrate their rates, so A never changes.
+        Rows: rates, changes of rate, and sums of rates, which are the turned angles over dt: all in rad/s, and the
+        same for every QP.
     l, u : ndarray, shape (3 N n,)
         Bounds.
     """
@@ -84,6 +86,8 @@ def build_qp(
     single = isinstance(models, LinearModel)
     sequence: Sequence[LinearModel] = [models] if isinstance(models, LinearModel) else models
     n_states, n = sequence[0].B.shape
+    if any(model.dt != sequence[0].dt for model in sequence):
+        raise ValueError("models have different periods dt")
     if not single and len(sequence) != tuning.horizon:
         raise ValueError(f"models has {len(sequence)} entries, expected 1 or the horizon {tuning.horizon}")
     _check_shapes(x, reference, u_previous, tuning.horizon, n_states, n)
@@ -96,8 +100,8 @@ def build_qp(
         b[:, k * n : (k + 1) * n] = model.B
         c[k * n_states : (k + 1) * n_states] = model.c
     start[:] = x
-    states[:] = reference.states.T
-    inputs[:] = reference.inputs.T
+    states.reshape((n_states, -1), order="F")[:] = reference.states.T
+    inputs.reshape((n, -1), order="F")[:] = reference.inputs.T
     previous[:] = u_previous
     weights[:] = tuning.position_weight, tuning.velocity_weight, tuning.angle_weight, tuning.input_weight
     terminal[:] = terminal_weight
@@ -108,19 +112,20 @@ def build_qp(
     dt[0] = sequence[0].dt
     function()
     p, q, lower, upper = function.outputs
-    return QuadraticProgram(p.copy(), q.copy(), constraint_matrix(tuning.horizon, n, sequence[0].dt),
+    return QuadraticProgram(p.copy(), q.copy(), constraint_matrix(tuning.horizon, n),
                             lower.copy(), upper.copy())  # fmt: skip
 
 
 @lru_cache(maxsize=16)
-def constraint_matrix(horizon: int, n: int, dt: float) -> sp.csc_matrix:
-    """Rows of the rates, of their changes, and of the angles they integrate to, shape (3 N n, N n)."""
+def constraint_matrix(horizon: int, n: int) -> sp.csc_matrix:
+    """Rows of the rates, of their changes, and of their sums (angles over dt), shape (3 N n, N n)."""
     each = sp.identity(n)
     rates = sp.identity(horizon * n)
     changes = sp.kron(sp.diags([1.0, -1.0], [0, -1], shape=(horizon, horizon)), each)
-    angles = sp.kron(dt * np.tril(np.ones((horizon, horizon))), each)
+    angles = sp.kron(np.tril(np.ones((horizon, horizon))), each)
     matrix = sp.csc_matrix(sp.vstack([rates, changes, angles]))
     matrix.sort_indices()
+    read_only(matrix.data)  # shared by all QPs of this size
     return matrix
 
 
@@ -215,12 +220,12 @@ def _condensing(horizon: int, n: int, single: bool, velocity: bool, angle: bool,
     l_all = [
         -ca.repmat(rate, horizon, 1),
         first - ca.repmat(change, horizon, 1),
-        ca.repmat(lower - x[4:], horizon, 1),
+        ca.repmat((lower - x[4:]) / dt, horizon, 1),
     ]
     u_all = [
         ca.repmat(rate, horizon, 1),
         first + ca.repmat(change, horizon, 1),
-        ca.repmat(upper - x[4:], horizon, 1),
+        ca.repmat((upper - x[4:]) / dt, horizon, 1),
     ]
     function = ca.Function(
         "condense",

@@ -9,6 +9,8 @@ import numpy as np
 
 from ..toml_table import read_toml
 
+METHODS = ("closed_form", "multiple_shooting", "single_shooting")
+SCHEMES = ("rk4", "rk8")
 FALLBACKS = ("shifted_plan", "raise")
 
 
@@ -102,9 +104,9 @@ def load_tuning(path: str | Path) -> Tuning:
             max_iterations=solver.integer("max_iterations", 4000),
             fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),
             model=Model(
-                method=model.text("method", Model.method),
+                method=model.text("method", Model.method, choices=METHODS),
                 segments=model.integer("segments", Model.segments),
                 steps=model.integer("steps", Model.steps),
-                scheme=model.text("scheme", Model.scheme),
+                scheme=model.text("scheme", Model.scheme, choices=SCHEMES),
             ),
         )

@@ -100,8 +100,10 @@ class TrackingMPC:
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         self._model.reset(x, pose)
         # One throw-away step pays for building graphs and workspaces before the clock runs.
+        self._u = np.zeros(self.robot.n_rods)
         self.step(0, x)
         self.mpc.reset()
+        self.mpc.prepare(linearise(self._model, x, np.zeros(self.robot.n_rods), self._period))
         self._model.reset(x, pose)
         self._u = np.zeros(self.robot.n_rods)
 

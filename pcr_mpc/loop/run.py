@@ -12,10 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from ..frozen import freeze
+from ..plant.dynamics import Plant
 from .scene import Scene
 
-# Commands within this of a limit keep it (rounding).
+# Commands within this of a limit keep it: rounding for rates, the QP's tolerance for angles.
 _LIMIT_SLACK = 1e-9
+_ANGLE_SLACK = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +32,8 @@ class Run:
         What ran.
     seed : int
         Of the measurement noise.
+    dt : float
+        Step of the plant [s].
     t : ndarray, shape (K + 1,)
         [s].
     x : ndarray, shape (K + 1, 4 + n)
@@ -51,6 +56,7 @@ class Run:
     controller: str
     plant: str
     seed: int
+    dt: float
     t: np.ndarray
     x: np.ndarray
     reference: np.ndarray
@@ -59,6 +65,14 @@ class Run:
     control_time: np.ndarray
     iterations: np.ndarray
     events: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def steps_per_period(self) -> int:
+        """Plant steps in a control period."""
+        return round(self.scene.period / self.dt)
 
     @property
     def error(self) -> np.ndarray:
@@ -69,14 +83,25 @@ class Run:
         """Control periods in which a command broke the limit on rate, on its change, or on the angle."""
         robot, period = self.scene.robot, self.scene.period
         change = np.diff(self.u, axis=0, prepend=np.zeros((1, robot.n_rods)))
-        per = self.scene.steps_per_period
-        angles = self.x[per::per, 4:][: len(self.u)]
+        # Where the command leads, not where the motor's stop lets it get.
+        starts = self.x[:: self.steps_per_period, 4:][: len(self.u)]
+        angles = starts + period * self.u[: len(starts)]
         lower, upper = robot.angle_limits.T
         broken = np.abs(self.u).max(axis=1, initial=0.0) > robot.rate_limit + _LIMIT_SLACK
         broken |= np.abs(change).max(axis=1, initial=0.0) > robot.acceleration_limit * period + _LIMIT_SLACK
-        outside = ((angles < lower - _LIMIT_SLACK) | (angles > upper + _LIMIT_SLACK)).any(axis=1)
+        outside = ((angles < lower - _ANGLE_SLACK) | (angles > upper + _ANGLE_SLACK)).any(axis=1)
         broken[: len(outside)] |= outside
         return int(broken.sum())
+
+    def peak_torque(self) -> float:
+        """Largest torque that a motor had to supply, by the exact rods at the control periods [N m].
+
+        The robot's torque limit is not enforced; this is what to hold against it.
+        """
+        plant = Plant(self.scene.robot, method="closed_form", dt=self.dt)
+        plant.reset(self.x[0], self.scene.start())
+        states = self.x[:: self.steps_per_period]
+        return float(max(np.abs(plant.equilibrium(x).motor_torque).max() for x in states))
 
     def hash(self) -> str:
         """Digest of states and inputs: equal for runs that are equal bit for bit."""
@@ -108,12 +133,14 @@ class Run:
                 name: percentiles(1e6 * self.control_time[:, 1 + i])
                 for i, name in enumerate(("linearise", "update", "solve"))
             },
-            "plant_budget_us": 1e6 * self.scene.plant.dt,
+            "plant_budget_us": 1e6 * self.dt,
             "control_budget_us": 1e6 * self.scene.period,
             "qp_iterations": {
                 "p50": int(np.median(self.iterations)) if len(self.iterations) else None,
                 "max": int(self.iterations.max(initial=0)),
             },
+            "peak_torque_Nm": self.peak_torque(),
+            "torque_limit_Nm": self.scene.robot.torque_limit,
             "limit_violations": self.limit_violations(),
             "fallbacks": kinds.count("fallback"),
             "failures": kinds.count("failure"),
@@ -131,7 +158,7 @@ class Run:
             control_time=self.control_time, iterations=self.iterations,
         )  # fmt: skip
         n = self.scene.robot.n_rods
-        per = self.scene.steps_per_period
+        per = self.steps_per_period
         with open(files["run.csv"], "w", newline="", encoding="utf-8") as handle:
             writer = csv.writer(handle)
             writer.writerow(["t_s", "p_x_m", "p_y_m", "v_x_m_s", "v_y_m_s", *(f"q{i}_rad" for i in range(n)),

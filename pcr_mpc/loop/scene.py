@@ -18,6 +18,9 @@ from ..plant.statics import METHODS
 from ..toml_table import Table, read_toml
 from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 
+# Distance of the start from the reference that is taken for the same place [m].
+_START_TOLERANCE = 1e-3
+
 
 @dataclass(frozen=True)
 class PlantSettings:
@@ -77,19 +80,29 @@ class Scene:
     tip_noise: float
 
     @property
-    def steps_per_period(self) -> int:
-        """Plant steps in a control period."""
-        return round(self.period / self.plant.dt)
-
-    @property
     def n_periods(self) -> int:
         """Control periods in the run."""
         return round(self.duration / self.period)
 
     def start(self) -> Equilibrium:
-        """Solve for the pose in which the robot starts, in balance without load."""
+        """Solve for the pose in which the robot starts, in balance without load.
+
+        Raises
+        ------
+        ModelError
+            The free tip at ``start_motors`` is not where the reference begins.
+        """
         if self.start_motors is not None:
-            return forward_statics(self.robot, self.start_motors)
+            eq = forward_statics(self.robot, self.start_motors)
+            if self.trajectory is not None:
+                begin = self.trajectory(np.zeros(1))[0, 0]
+                if np.hypot(*(begin - eq.p)) > _START_TOLERANCE:
+                    raise ModelError(
+                        f"{self.name}: at start.motors the free tip rests at {eq.p} m (mode {eq.mode}), but "
+                        f"the reference begins at {begin} m; start from that tip and a mode instead",
+                        key="start.motors",
+                    )
+            return eq
         return inverse_statics(self.robot, self.start_tip, mode=self.start_mode)
 
     def make_plant(self) -> Plant:
@@ -129,7 +142,7 @@ def load_scene(path: str | Path) -> Scene:
             motors = start.vector("motors", robot.n_rods, None)
             mode = start.text("mode", None)
             velocity = start.vector("velocity", 2, (0.0, 0.0))
-            if (tip is None) == (motors is None) or (tip is not None and mode is None):
+            if (tip is None) == (motors is None) or (tip is None) != (mode is None):
                 raise start.fail("tip", "give either tip and mode, or motors")
         with file.table("plant") as table:
             plant = PlantSettings(
@@ -144,6 +157,8 @@ def load_scene(path: str | Path) -> Scene:
             period = control.number("period", above=0.0)
             tuning = control.text("tuning", None)
             ratio = period / plant.dt
+            if duration < period:
+                raise control.fail("period", f"is {period} s, longer than the duration {duration} s")
             if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio:
                 raise control.fail("period", f"is {period} s, not a multiple of the plant's step {plant.dt} s")
         with file.table("load", {}) as load, file.table("sensor", {}) as sensor:

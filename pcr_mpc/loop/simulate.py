@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ..errors import PCRError, SimulationError
+from ..errors import SimulationError
 from ..plant.dynamics import Plant
 from .controllers import Controller
 from .run import Run
@@ -67,6 +67,7 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
             controller=controller.name,
             plant=f"{plant.method}, {plant.integrator}, dt = {1e3 * plant.dt:g} ms",
             seed=seed,
+            dt=plant.dt,
             t=t,
             x=states[: done + 1].copy(),
             reference=reference,
@@ -105,7 +106,7 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
                 plant_time[done] = time.perf_counter() - began
                 done += 1
                 states[done] = x
-    except (PCRError, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt) as error:  # whatever it is, the run so far is kept
         what = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
         t = done * plant.dt
         events.append({"t": t, "kind": "failure", "message": what})

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from ..plant.dynamics import Plant
 from ..plant.statics import METHODS
 from .controllers import make_controller
-from .run import percentiles
+from .run import Run, percentiles
 from .scene import Scene
 from .simulate import simulate
 
@@ -34,9 +34,10 @@ def time_scene(scene: Scene, steps: int = 2000, *, progress: bool = False) -> di
     Returns
     -------
     dict
-        ``components``: list of {name, method, p50, p95, p99, max, n} in us; ``machine``; ``versions``.
+        ``components``: list of {name, method, p50, p95, p99, max, n} in us, plant steps also with ``force_error``,
+        the largest relative error of F along the run; ``machine``; ``versions``.
     """
-    scene = replace(scene, duration=max(scene.duration, 20 * scene.period))
+    scene = replace(scene, duration=max(scene.duration, 3 * _WARM_UP * scene.period))
     controller = make_controller(scene)
     run = simulate(scene, scene.make_plant(), controller, progress=progress)
     pose = scene.start()
@@ -48,10 +49,11 @@ def time_scene(scene: Scene, steps: int = 2000, *, progress: bool = False) -> di
             scheme=scene.plant.scheme, integrator="velocity_verlet", dt=1e-3,
         )  # fmt: skip
         plant.reset(run.x[0], pose)
-        components.append(_component("plant step", method, _plant_times(plant, scene, run, n, progress)))
+        component = _component("plant step", method, _plant_times(plant, scene, run, n, progress))
+        components.append({**component, "force_error": _force_error(plant, scene, run)})
     if scene.trajectory is not None:
         controller.start(pose)
-        states = run.x[:: scene.steps_per_period]
+        states = run.x[:: run.steps_per_period]
         parts = np.empty((len(run.u), 4))
         for k in range(len(run.u)):
             began = time.perf_counter()
@@ -66,9 +68,9 @@ def time_scene(scene: Scene, steps: int = 2000, *, progress: bool = False) -> di
     return {"scene": scene.name, "components": components, "machine": machine(), "versions": versions()}
 
 
-def _plant_times(plant: Plant, scene: Scene, run: Any, n: int, progress: bool) -> np.ndarray:
+def _plant_times(plant: Plant, scene: Scene, run: Run, n: int, progress: bool) -> np.ndarray:
     """Times of n plant steps; when the run's inputs are used up, it starts again from the beginning."""
-    per = round(scene.period / plant.dt)
+    per = max(1, round(scene.period / plant.dt))
     times = np.empty(n)
     lap = len(run.u) * per
     x = run.x[0]
@@ -82,6 +84,19 @@ def _plant_times(plant: Plant, scene: Scene, run: Any, n: int, progress: bool) -
         x = plant.step(x, u, scene.force)
         times[k] = time.perf_counter() - began
     return times
+
+
+def _force_error(plant: Plant, scene: Scene, run: Run) -> float:
+    """Largest error of F along the run against the closed form, relative to the rods' forces."""
+    exact = Plant(scene.robot, method="closed_form")
+    pose, worst = scene.start(), 0.0
+    exact.reset(run.x[0], pose)
+    plant.reset(run.x[0], pose)
+    for x in run.x[:: run.steps_per_period][:200]:
+        eq = exact.equilibrium(x)
+        error = np.linalg.norm(plant.force(x[:2], x[4:]) - eq.force)
+        worst = max(worst, float(error / np.linalg.norm(eq.rod_forces)))
+    return worst
 
 
 def _component(name: str, method: str, seconds: np.ndarray) -> dict[str, Any]:

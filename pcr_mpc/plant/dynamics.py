@@ -15,8 +15,8 @@ from .statics import checked_shooting, make_solver
 
 # A simulation uses the derivatives only to predict the next pose.
 _PREDICTOR_ACCURACY = 1e-2
-# Relative drift of a rod's invariant beyond which its force may be off by more than a per cent.
-_LARGEST_DRIFT = 1e-4
+# Relative drift of a rod's invariant beyond which its force may be off by per cents.
+_LARGEST_DRIFT = 1e-3
 
 
 class Plant:
@@ -119,7 +119,7 @@ class Plant:
 
     def force(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         """F at (p, q), following the branch [N]."""
-        self._go(p, q, _PREDICTOR_ACCURACY)
+        self._go(np.asarray(p, dtype=float), np.asarray(q, dtype=float), _PREDICTOR_ACCURACY)
         return self._solver.force()
 
     def force_and_jacobians(
@@ -151,14 +151,6 @@ class Plant:
         except ConvergenceError:
             self.robot.require_reachable(p)  # the plainer reason, if it is the reason
             raise
-        unstable = self._solver.unstable_rods()
-        if unstable:
-            self._solver.go_back()
-            raise UnstableError(
-                f"rod {unstable[0]} is unstable at p = {p} m, q = {q} rad: it would snap to another shape; "
-                "slow down or keep away from this pose",
-                rod=unstable[0],
-            )
         drift = self._solver.drift()
         if not drift <= _LARGEST_DRIFT:
             self._solver.go_back()
@@ -168,6 +160,14 @@ class Plant:
                 residual=drift,
                 iterations=0,
                 last=None,
+            )
+        unstable = self._solver.unstable_rods()
+        if unstable:
+            self._solver.go_back()
+            raise UnstableError(
+                f"rod {unstable[0]} is unstable at p = {p} m, q = {q} rad: it would snap to another shape; "
+                "slow down or keep away from this pose",
+                rod=unstable[0],
             )
         self._at = at
 

@@ -108,7 +108,7 @@ def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
     moves = ca.vertcat(*blocks)
 
     energy = sum(end[6] for end in ends)
-    drift = _invariant(ends[-1][2:6]) - _invariant(z[0])
+    drift = invariant(ends[-1][2:6]) - invariant(z[0])
     weights = ca.repmat(ca.vertcat(1, 1 / load, 1 / load, 1 / ca.sqrt(load)), n, 1)
     scalars = ca.vertcat(
         norm, ca.norm_2(weights * moves[:, 0]), energy, conjugate_points, drift / (load + z[0][3] ** 2 / 2)
@@ -119,7 +119,7 @@ def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
     return newton, ca.Function("rod_residual", [flat, pose], [norm, z[0][1:]], options)
 
 
-def _invariant(z: Any) -> Any:
+def invariant(z: Any) -> Any:
     """m^2/2 + n . t, constant along an exact rod; its drift measures the discretisation."""
     return z[3] ** 2 / 2 + z[1] * ca.cos(z[0]) + z[2] * ca.sin(z[0])
 

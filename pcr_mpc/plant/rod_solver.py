@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..buffered import BufferedFunction
-from ..errors import ConvergenceError
+from ..errors import ConvergenceError, PCRError, UnstableError
 from ..frozen import read_only
-from .chart import held_shapes
+from . import elastica
+from .chart import critical_load, held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod_method import RodMethod, warm_step
@@ -23,13 +24,16 @@ TOLERANCE = 1e-10
 # A warm start whose unknowns move further than this beyond the prediction may have left its branch.
 _BRANCH_CHANGE = 0.3
 _ROUGH = 1e-4
-_SMALLEST_SUBSTEP = 1.0 / 64.0
+# A rod that can be followed no further with less than this left to lambda_c has come to a fold.
+_FOLD_MARGIN = 0.15
+_SMALLEST_SUBSTEP = 1.0 / 1024.0
 
 
 class _NotConverged(Exception):
     def __init__(self, rod: int, residual: float, iterations: int, unknowns: np.ndarray, reason: str) -> None:
         super().__init__(reason)
         self.rod, self.residual, self.iterations, self.unknowns = rod, residual, iterations, unknowns
+        self.last_state: _RodState | None = None  # as far as continuation came
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +127,8 @@ class RodSolver:
 
         A cold start takes, for each rod, the stable shape of least energy.
         """
+        if nodes is not None and (nodes.ndim != 3 or nodes.shape[:2] != (self.robot.n_rods, 4) or not nodes.shape[2]):
+            raise ValueError(f"guess has nodes of shape {nodes.shape}, expected ({self.robot.n_rods}, 4, N)")
         poses = self._poses(p, q)
         try:
             if nodes is not None:
@@ -148,6 +154,8 @@ class RodSolver:
 
         Raises
         ------
+        UnstableError
+            The branch ends on the way: the rod would snap to another shape.
         ConvergenceError
             Neither Newton's method nor continuation got there.
         """
@@ -257,6 +265,7 @@ class RodSolver:
             except _NotConverged:
                 substep /= 2
                 if substep < _SMALLEST_SUBSTEP:
+                    first.last_state = state
                     raise first from None
             else:
                 done, substep = target, 2 * substep
@@ -342,7 +351,20 @@ class RodSolver:
             iterations,
         )
 
-    def _error(self, failure: _NotConverged, p: np.ndarray, q: np.ndarray) -> ConvergenceError:
+    def _error(self, failure: _NotConverged, p: np.ndarray, q: np.ndarray) -> PCRError:
+        if failure.last_state is not None:
+            last = failure.last_state
+            nodes = self.method.to_nodes(last.unknowns, last.pose[2], 8)
+            log_tip_angle, load, _ = elastica.from_nodes(nodes)
+            margin = 1.0 - load / critical_load(log_tip_angle)
+            if margin < _FOLD_MARGIN:
+                return UnstableError(
+                    f"rod {failure.rod} cannot follow to p = {np.array(p)} m, q = {np.array(q)} rad: its branch ends "
+                    f"on the way, with {100 * margin:.1f} % left to its limit of stability; it would snap to another "
+                    "shape; keep away from this pose",
+                    rod=failure.rod,
+                    margin=margin,
+                )
         base = np.array(self.robot.rods[failure.rod].base)
         reach = float(np.hypot(*(np.array(p) - base))) / self.robot.rods[failure.rod].length
         return ConvergenceError(

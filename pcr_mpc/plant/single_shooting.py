@@ -13,9 +13,9 @@ from ..buffered import BufferedFunction
 from ..errors import ConvergenceError
 from .chart import held_shapes
 from .equilibrium import Equilibrium
-from .multiple_shooting import robot_residual, rod_newton
+from .multiple_shooting import invariant, robot_residual, rod_newton
 from .robot import Robot
-from .rod import sample_rod
+from .rod import propagation
 
 _ACCEPTED_RESIDUAL = 1e-8
 
@@ -28,10 +28,25 @@ def _residual_and_jacobians(robot: Robot, steps: int, scheme: str) -> Any:
     return ca.Function("single_shooting", [y, p, q], [r, ca.jacobian(r, y), ca.jacobian(r, ca.vertcat(p, q))])
 
 
+@lru_cache(maxsize=16)
+def _judge(steps: int, scheme: str) -> Any:
+    """Energy and drift of the integration that was solved, and conjugate points on eight nodes along it."""
+    base, pose = ca.MX.sym("base", 4), ca.MX.sym("pose", 3)
+    nodes = [base]
+    for _ in range(7):
+        nodes.append(propagation(4, "rk8")(nodes[-1], 1.0 / 8.0)[2:6])
+    newton, _ = rod_newton(8, 4, "rk8")
+    conjugate_points = newton(ca.vertcat(*nodes), pose)[4][3]
+    end = propagation(steps, scheme)(base, 1.0)
+    drift = (invariant(end[2:6]) - invariant(base)) / (1 + ca.norm_2(base[1:3]) + base[3] ** 2 / 2)
+    return ca.Function("judge", [base, pose], [ca.vertcat(end[6], conjugate_points, drift)])
+
+
 class SingleShooting:
     """Eq. (5)-(6): the base loads of every rod and the joint force, 3n + 2 unknowns (8 for two rods).
 
-    Same calls as `RodSolver`: it remembers the last pose as the next guess.
+    Same calls as `RodSolver`: it remembers the last pose as the next guess. It is the baseline: nothing keeps it
+    from converging to another branch.
 
     Parameters
     ----------
@@ -46,9 +61,9 @@ class SingleShooting:
         self.robot = robot
         self._evaluate = BufferedFunction(_residual_and_jacobians(robot, steps, scheme))
         self._units = np.stack([robot.stiffnesses / robot.lengths**e for e in (2, 2, 1)], axis=1)
-        # Energy and conjugate points need states along the rod: they are judged on eight nodes.
-        self._judge, _ = rod_newton(8, 4, "rk8")
+        self._judge = BufferedFunction(_judge(steps, scheme))
         self._last: Equilibrium | None = None
+        self._before: Equilibrium | None = None
 
     def start(self, p: np.ndarray, q: np.ndarray, nodes: np.ndarray | None = None) -> None:
         """Solve at (p, q) from the base states of ``nodes``, shape (n, 4, N), or cold (None)."""
@@ -56,8 +71,12 @@ class SingleShooting:
 
     def move(self, p: np.ndarray, q: np.ndarray, *, derivatives: float = 0.0) -> None:
         """Solve at (p, q) from the last pose. The derivatives always belong to the solution."""
-        assert self._last is not None
-        self._last = self._solve(p, q, self._last.nodes)
+        last = self._solution()
+        self._last, self._before = self._solve(p, q, last.nodes), last
+
+    def go_back(self) -> None:
+        """Undo the last `move`."""
+        self._last, self._before = self._before, self._last
 
     def force(self) -> np.ndarray:
         """F at the last pose, shape (2,) [N]."""
@@ -81,7 +100,8 @@ class SingleShooting:
         return self._solution()
 
     def _solution(self) -> Equilibrium:
-        assert self._last is not None
+        if self._last is None:
+            raise RuntimeError("no pose to start from: call start (or Plant.reset) first")
         return self._last
 
     def _cold(self, p: np.ndarray, q: np.ndarray) -> list[np.ndarray]:
@@ -132,11 +152,12 @@ class SingleShooting:
         sensitivity = -np.linalg.solve(evaluate.outputs[1], evaluate.outputs[2])
         base_loads = y[:-2].reshape(n, 3)
         solved = np.concatenate([q[:, None], base_loads / units], axis=1)[:, :, None]
-        scalars = np.empty((n, 5))
+        scalars = np.empty((n, 3))
         for i, rod in enumerate(self.robot.rods):
-            sampled = sample_rod(solved[i], 9)[2:, :8]
-            pose = np.append((p - rod.base) / rod.length, q[i])
-            scalars[i] = self._judge(sampled.ravel(order="F"), pose)[4].full().ravel()
+            self._judge.inputs[0][:] = solved[i, :, 0]
+            self._judge.inputs[1][:] = *((p - rod.base) / rod.length), q[i]
+            self._judge()
+            scalars[i] = self._judge.outputs[0]
         return Equilibrium(
             robot=self.robot,
             p=p.copy(),
@@ -147,11 +168,11 @@ class SingleShooting:
             dforce_dq=sensitivity[-2:, 2:].copy(),
             motor_torque=-base_loads[:, 2],
             dtorque_dq=-np.diagonal(sensitivity[2:-2:3, 2:]).copy(),
-            energy=float((self.robot.stiffnesses / self.robot.lengths) @ scalars[:, 2]),
+            energy=float((self.robot.stiffnesses / self.robot.lengths) @ scalars[:, 0]),
             rod_forces=base_loads[:, :2].copy(),
             nodes=solved,
             residual_norm=norm,
             iterations=evaluations,
-            drift=float(np.abs(scalars[:, 4]).max()),
-            unstable_rods=tuple(int(i) for i in np.flatnonzero(scalars[:, 3] > 0)),
+            drift=float(np.abs(scalars[:, 2]).max()),
+            unstable_rods=tuple(int(i) for i in np.flatnonzero(scalars[:, 1] > 0)),
         )

@@ -121,8 +121,12 @@ def _refined(
 
 def checked_shooting(segments: int, steps: int, scheme: str) -> Shooting:
     """Return the discretisation if it makes sense, or raise ValueError."""
-    if segments < 1 or steps < 1:
-        raise ValueError(f"segments = {segments} and steps = {steps} must be at least 1")
+    if (
+        not (isinstance(segments, int | np.integer) and isinstance(steps, int | np.integer))
+        or segments < 1
+        or steps < 1
+    ):
+        raise ValueError(f"segments = {segments} and steps = {steps} must be whole numbers of at least 1")
     if scheme not in SCHEMES:
         raise ValueError(f"scheme is {scheme!r}, expected one of {', '.join(SCHEMES)}")
     return Shooting(int(segments), int(steps), scheme)
@@ -153,7 +157,7 @@ def _of(robot: Robot, guess: Equilibrium) -> Equilibrium:
 
 def _checked_nodes(guess: np.ndarray, robot: Robot) -> np.ndarray:
     nodes = np.asarray(guess, dtype=float)
-    if nodes.ndim != 3 or nodes.shape[:2] != (robot.n_rods, 4) or not np.isfinite(nodes).all():
+    if nodes.ndim != 3 or nodes.shape[:2] != (robot.n_rods, 4) or not nodes.size or not np.isfinite(nodes).all():
         raise ValueError(
             f"guess has shape {nodes.shape} (finite: {np.isfinite(nodes).all()}), expected ({robot.n_rods}, 4, N)"
         )

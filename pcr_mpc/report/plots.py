@@ -70,7 +70,7 @@ def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
 
 def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
     """Rods at some of the run's states, followed from one to the next."""
-    plant = Plant(run.scene.robot, method="closed_form", dt=run.scene.plant.dt)
+    plant = Plant(run.scene.robot, method="closed_form", dt=run.dt)
     plant.reset(run.x[0], run.scene.start())
     wanted = set(indices.tolist())
     # The branch is followed through every tenth state, not jumped to.
@@ -154,8 +154,8 @@ def plot_times(axes: Any, samples: dict[str, tuple[np.ndarray, str]], budgets: d
 
 def animate_run(run: Run, path: Path, progress: bool = False) -> None:
     """Write a GIF of the robot moving."""
-    every = round(1.0 / _FRAMES_PER_SECOND / run.scene.plant.dt)
-    last = min(len(run.t), int(_LONGEST_ANIMATION / run.scene.plant.dt))
+    every = max(1, round(1.0 / _FRAMES_PER_SECOND / run.dt))
+    last = min(len(run.t), int(_LONGEST_ANIMATION / run.dt))
     indices = np.arange(0, last, every)
     poses = poses_along(run, indices)
     shapes = np.stack([eq.shape(40) for eq in poses])

@@ -43,6 +43,7 @@ def summary_table(summary: dict[str, Any]) -> str:
     iterations = summary["qp_iterations"]
     lines += [
         f"QP iterations     p50 {iterations['p50']}, max {iterations['max']}",
+        f"peak torque       {summary['peak_torque_Nm']:.3f} N m (limit {summary['torque_limit_Nm']:g}, not enforced)",
         f"limit violations  {summary['limit_violations']}",
         f"fall-backs        {summary['fallbacks']}",
         f"failures          {summary['failures']}",
