@@ -142,3 +142,12 @@ def test_pick_and_place_rests_at_both_ends_and_peaks_as_stated():
     peak = np.hypot(*samples[:, 2].T).max()
     stated = re.search(r"peak acceleration .*?([\d.]+) m/s\^2", (MODELS / "README.md").read_text())
     assert peak == pytest.approx(float(stated[1]), abs=0.05)
+
+
+def test_tunings_know_the_plants_methods():
+    """The controller may not import the plant, so it spells the names out once more."""
+    from pcr_mpc.control import tuning
+    from pcr_mpc.plant import rod, statics
+
+    assert tuple(rod.SCHEMES) == tuning.SCHEMES
+    assert statics.METHODS == tuning.METHODS

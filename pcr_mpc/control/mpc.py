@@ -213,7 +213,8 @@ class _Workspace:
     def solve(self, qp: QuadraticProgram, warm: np.ndarray | None) -> Solution:
         """Solve with the rates' rows alone; where that breaks another row, or fails, with all of them.
 
-        An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half.
+        An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half;
+        its multipliers are those of the rates' rows, the others being zero.
         """
         n_rates, spent = self.rates_only.m, 0
         try:
@@ -227,8 +228,7 @@ class _Workspace:
             rows = self._dense @ solution.x
             broken = max(float((qp.l - rows).max()), float((rows - qp.u).max()), 0.0)
             if broken <= self._tolerance:
-                y = np.concatenate([solution.y, np.zeros(len(rows) - n_rates)])
-                return Solution(solution.x, y, solution.iterations, broken, solution.dual_residual)
+                return replace(solution, primal_residual=broken)
             spent, warm = solution.iterations, solution.x
         self.complete.update(qp.P, qp.q, qp.l, qp.u)
         if warm is not None:

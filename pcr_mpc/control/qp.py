@@ -132,13 +132,14 @@ def constraint_matrix(horizon: int, n: int) -> sp.csc_matrix:
 def _check_shapes(
     x: np.ndarray, reference: Reference, u_previous: np.ndarray, horizon: int, n_states: int, n: int
 ) -> None:
-    expected = {"x": (n_states,), "u_previous": (n,), "reference.states": (horizon, n_states),
-                "reference.inputs": (horizon, n)}  # fmt: skip
-    found = {"x": x, "u_previous": u_previous, "reference.states": reference.states,
-             "reference.inputs": reference.inputs}  # fmt: skip
-    for name, shape in expected.items():
-        if found[name].shape != shape:
-            raise ValueError(f"{name} has shape {found[name].shape}, expected {shape}")
+    for name, array, shape in (
+        ("x", x, (n_states,)),
+        ("u_previous", u_previous, (n,)),
+        ("reference.states", reference.states, (horizon, n_states)),
+        ("reference.inputs", reference.inputs, (horizon, n)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
 
 
 @lru_cache(maxsize=32)
