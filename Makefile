@@ -24,6 +24,7 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/paper_figures.py --out docs
 	$(BIN)/python experiments/finite_differences.py --out docs
 	$(BIN)/python experiments/equilibria.py --out docs
+	$(BIN)/python experiments/time_step_limits.py --out docs
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
 	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
 
