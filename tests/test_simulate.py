@@ -70,7 +70,7 @@ def test_violations_are_counted(run):
 
 def test_peak_torque_is_that_of_the_statics(run, pair):
     # The centre pose takes 0.76 N m; the figure of eight takes more, within the limit.
-    assert 0.76 < run.peak_torque() < pair.torque_limit
+    assert 0.76 < run.peak_torque < pair.torque_limit
 
 
 def test_controllers_plan_and_plant_are_separate_objects(lemniscate):

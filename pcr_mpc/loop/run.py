@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from ..frozen import freeze
 from ..plant.dynamics import Plant
+from ..plant.equilibrium import Equilibrium
 from .scene import Scene
 
 # Commands within this of a limit keep it: rounding for rates, the QP's tolerance for angles.
@@ -32,6 +34,8 @@ class Run:
         What ran.
     seed : int
         Of the measurement noise.
+    pose : Equilibrium
+        In which the robot started.
     dt : float
         Step of the plant [s].
     t : ndarray, shape (K + 1,)
@@ -56,6 +60,7 @@ class Run:
     controller: str
     plant: str
     seed: int
+    pose: Equilibrium
     dt: float
     t: np.ndarray
     x: np.ndarray
@@ -93,13 +98,14 @@ class Run:
         broken[: len(outside)] |= outside
         return int(broken.sum())
 
+    @cached_property
     def peak_torque(self) -> float:
         """Largest torque that a motor had to supply, by the exact rods at the control periods [N m].
 
         The robot's torque limit is not enforced; this is what to hold against it.
         """
         plant = Plant(self.scene.robot, method="closed_form", dt=self.dt)
-        plant.reset(self.x[0], self.scene.start())
+        plant.reset(self.x[0], self.pose)
         states = self.x[:: self.steps_per_period]
         return float(max(np.abs(plant.equilibrium(x).motor_torque).max() for x in states))
 
@@ -139,7 +145,7 @@ class Run:
                 "p50": int(np.median(self.iterations)) if len(self.iterations) else None,
                 "max": int(self.iterations.max(initial=0)),
             },
-            "peak_torque_Nm": self.peak_torque(),
+            "peak_torque_Nm": self.peak_torque,
             "torque_limit_Nm": self.scene.robot.torque_limit,
             "limit_violations": self.limit_violations(),
             "fallbacks": kinds.count("fallback"),

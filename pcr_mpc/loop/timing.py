@@ -40,7 +40,7 @@ def time_scene(scene: Scene, steps: int = 2000, *, progress: bool = False) -> di
     scene = replace(scene, duration=max(scene.duration, 3 * _WARM_UP * scene.period))
     controller = make_controller(scene)
     run = simulate(scene, scene.make_plant(), controller, progress=progress)
-    pose = scene.start()
+    pose = run.pose
     components = []
     for method in METHODS:
         n = max(_WARM_UP + 10, int(steps * _SLOW.get(method, 1.0)))
@@ -74,11 +74,10 @@ def _plant_times(plant: Plant, scene: Scene, run: Run, n: int, progress: bool) -
     times = np.empty(n)
     lap = len(run.u) * per
     x = run.x[0]
-    pose = scene.start()
     for k in tqdm(range(n), desc=f"plant, {plant.method}", unit="step", disable=not progress):
         if k % lap == 0:
             x = run.x[0]
-            plant.reset(x, pose)
+            plant.reset(x, run.pose)
         u = run.u[k % lap // per]
         began = time.perf_counter()
         x = plant.step(x, u, scene.force)
@@ -89,9 +88,9 @@ def _plant_times(plant: Plant, scene: Scene, run: Run, n: int, progress: bool) -
 def _force_error(plant: Plant, scene: Scene, run: Run) -> float:
     """Largest error of F along the run against the closed form, relative to the rods' forces."""
     exact = Plant(scene.robot, method="closed_form")
-    pose, worst = scene.start(), 0.0
-    exact.reset(run.x[0], pose)
-    plant.reset(run.x[0], pose)
+    worst = 0.0
+    exact.reset(run.x[0], run.pose)
+    plant.reset(run.x[0], run.pose)
     for x in run.x[:: run.steps_per_period][:200]:
         eq = exact.equilibrium(x)
         error = np.linalg.norm(plant.force(x[:2], x[4:]) - eq.force)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from ..buffered import BufferedFunction
 from ..errors import ConvergenceError, PCRError, UnstableError
-from ..frozen import read_only
 from . import elastica
 from .chart import critical_load, held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod_method import RodMethod, warm_step
+from .rod_state import RobotState, RodState
 
 MAX_ITERATIONS = 60
 # A warm start that needs more is better served by a smaller sub-step.
@@ -33,67 +32,7 @@ class _NotConverged(Exception):
     def __init__(self, rod: int, residual: float, iterations: int, unknowns: np.ndarray, reason: str) -> None:
         super().__init__(reason)
         self.rod, self.residual, self.iterations, self.unknowns = rod, residual, iterations, unknowns
-        self.last_state: _RodState | None = None  # as far as continuation came
-
-
-@dataclass(frozen=True, eq=False)
-class _RodState:
-    """One solved rod: normalised pose, unknowns, and what the last linear solve gave."""
-
-    pose: np.ndarray  # (3,) tip relative to base / L, clamp angle
-    unknowns: np.ndarray
-    tangent: np.ndarray  # d unknowns / d pose
-    loads: np.ndarray  # (3,) n_x, n_y, m at the base
-    load_tangent: np.ndarray  # (3, 3) d loads / d pose
-    scalars: np.ndarray  # (5,) residual, step length, energy, conjugate points, drift
-    residual: float
-    iterations: int
-
-
-class _RobotState:
-    """All rods as columns, the form in which the graph of a warm step takes and gives them."""
-
-    def __init__(self, robot: Robot, rods: list[_RodState]) -> None:
-        self.unknowns = np.stack([rod.unknowns for rod in rods], axis=1)
-        self.tangents = np.concatenate([rod.tangent for rod in rods], axis=1)
-        self.poses = np.stack([rod.pose for rod in rods], axis=1)
-        self.loads = np.stack([rod.loads for rod in rods], axis=1)
-        self.load_tangents = np.concatenate([rod.load_tangent for rod in rods], axis=1)
-        self.scalars = np.stack([rod.scalars for rod in rods], axis=1)
-        self.residual = math.hypot(*(rod.residual for rod in rods))
-        self.iterations = max(rod.iterations for rod in rods)
-        self.drift = float(np.abs(self.scalars[4]).sum())
-        self.unstable_rods = tuple(i for i, count in enumerate(self.scalars[3].tolist()) if count)
-        units = robot.stiffnesses / robot.lengths**2
-        moves = self.load_tangents[:2].reshape(2, -1, 3)
-        self.force = read_only(self.loads[:2] @ units)
-        self.k = read_only(np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths))
-        self.g = read_only(moves[:, :, 2] * units)
-
-    def take(self, outputs: list[np.ndarray], iterations: int) -> None:
-        """Copy the results of `warm_step`, which found no conjugate point."""
-        (self.unknowns[:], self.tangents[:], self.poses[:], self.loads[:], self.load_tangents[:],
-         self.scalars[:]) = outputs[:6]  # fmt: skip
-        self.residual, _, _, _, self.drift = outputs[6].tolist()
-        self.force, self.k, self.g = (read_only(output.copy()) for output in outputs[7:])
-        self.iterations = iterations
-        self.unstable_rods = ()
-
-    def rods(self) -> list[_RodState]:
-        """Split into rods."""
-        return [
-            _RodState(
-                self.poses[:, i].copy(),
-                self.unknowns[:, i].copy(),
-                self.tangents[:, 3 * i : 3 * i + 3].copy(),
-                self.loads[:, i].copy(),
-                self.load_tangents[:, 3 * i : 3 * i + 3].copy(),
-                self.scalars[:, i].copy(),
-                self.residual,
-                self.iterations,
-            )
-            for i in range(self.poses.shape[1])
-        ]
+        self.last_state: RodState | None = None  # as far as continuation came
 
 
 class RodSolver:
@@ -117,8 +56,8 @@ class RodSolver:
         self._newton = BufferedFunction(method.newton)
         self._check = BufferedFunction(method.residual)
         self._warm = [BufferedFunction(warm_step(robot, method, iterations)) for iterations in (1, 2)]
-        self._state: _RobotState | None = None
-        self._spare: _RobotState | None = None
+        self._state: RobotState | None = None
+        self._spare: RobotState | None = None
         self._force_units = robot.stiffnesses / robot.lengths**2
         self._moment_units = robot.stiffnesses / robot.lengths
 
@@ -137,7 +76,7 @@ class RodSolver:
                 ]
             else:
                 rods = [self._cold(i, pose) for i, pose in enumerate(poses)]
-            self._state, self._spare = _RobotState(self.robot, rods), _RobotState(self.robot, rods)
+            self._state, self._spare = RobotState(self.robot, rods), RobotState(self.robot, rods)
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
 
@@ -180,7 +119,7 @@ class RodSolver:
             rods = [self._follow(i, rods[i], pose, derivatives, continuation) for i, pose in enumerate(poses)]
         except _NotConverged as failure:
             raise self._error(failure, p, q) from None
-        self._state, self._spare = _RobotState(self.robot, rods), state
+        self._state, self._spare = RobotState(self.robot, rods), state
 
     def go_back(self) -> None:
         """Undo the last `move`."""
@@ -237,7 +176,7 @@ class RodSolver:
             unstable_rods=self.unstable_rods(),
         )
 
-    def _started(self) -> _RobotState:
+    def _started(self) -> RobotState:
         if self._state is None:
             raise RuntimeError("no pose to start from: call start (or Plant.reset) first")
         return self._state
@@ -249,7 +188,7 @@ class RodSolver:
             for rod, angle in zip(self.robot.rods, q, strict=True)
         ]
 
-    def _follow(self, i: int, start: _RodState, pose: np.ndarray, derivatives: float, continuation: bool) -> _RodState:
+    def _follow(self, i: int, start: RodState, pose: np.ndarray, derivatives: float, continuation: bool) -> RodState:
         try:
             return self._predict(i, start, pose, derivatives)
         except _NotConverged as failure:
@@ -271,7 +210,7 @@ class RodSolver:
                 done, substep = target, 2 * substep
         return state
 
-    def _predict(self, i: int, start: _RodState, pose: np.ndarray, derivatives: float) -> _RodState:
+    def _predict(self, i: int, start: RodState, pose: np.ndarray, derivatives: float) -> RodState:
         predicted = start.unknowns + start.tangent @ (pose - start.pose)
         state = self._solve(i, pose, predicted, derivatives, _WARM_ITERATIONS)
         branch = self.method.branch
@@ -279,7 +218,7 @@ class RodSolver:
             raise _NotConverged(i, state.residual, state.iterations, state.unknowns, "left its branch")
         return state
 
-    def _cold(self, i: int, pose: np.ndarray) -> _RodState:
+    def _cold(self, i: int, pose: np.ndarray) -> RodState:
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         xi, eta = cos * pose[0] + sin * pose[1], cos * pose[1] - sin * pose[0]
         last = _NotConverged(i, math.nan, 0, pose, "no stable shape found")
@@ -298,7 +237,7 @@ class RodSolver:
     @np.errstate(all="ignore")  # an overflow is a bad trial point, and rejected
     def _solve(
         self, i: int, pose: np.ndarray, unknowns: np.ndarray, derivatives: float, most: int = MAX_ITERATIONS
-    ) -> _RodState:
+    ) -> RodState:
         """Damped Newton from ``unknowns``.
 
         A step is kept if the next Newton step is shorter or the residual smaller. The residual alone will not
@@ -338,9 +277,9 @@ class RodSolver:
 
     def _rod_state(
         self, pose: np.ndarray, unknowns: np.ndarray, loads: np.ndarray, residual: float, iterations: int
-    ) -> _RodState:
+    ) -> RodState:
         _, tangent, _, load_tangent, scalars = self._newton.outputs
-        return _RodState(
+        return RodState(
             pose,
             unknowns,
             tangent.copy(),

@@ -1,0 +1,71 @@
+"""What a rod solver remembers of its last pose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..frozen import read_only
+from .robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class RodState:
+    """One solved rod: normalised pose, unknowns, and what the last linear solve gave."""
+
+    pose: np.ndarray  # (3,) tip relative to base / L, clamp angle
+    unknowns: np.ndarray
+    tangent: np.ndarray  # d unknowns / d pose
+    loads: np.ndarray  # (3,) n_x, n_y, m at the base
+    load_tangent: np.ndarray  # (3, 3) d loads / d pose
+    scalars: np.ndarray  # (5,) residual, step length, energy, conjugate points, drift
+    residual: float
+    iterations: int
+
+
+class RobotState:
+    """All rods as columns, the form in which the graph of a warm step takes and gives them."""
+
+    def __init__(self, robot: Robot, rods: list[RodState]) -> None:
+        self.unknowns = np.stack([rod.unknowns for rod in rods], axis=1)
+        self.tangents = np.concatenate([rod.tangent for rod in rods], axis=1)
+        self.poses = np.stack([rod.pose for rod in rods], axis=1)
+        self.loads = np.stack([rod.loads for rod in rods], axis=1)
+        self.load_tangents = np.concatenate([rod.load_tangent for rod in rods], axis=1)
+        self.scalars = np.stack([rod.scalars for rod in rods], axis=1)
+        self.residual = math.hypot(*(rod.residual for rod in rods))
+        self.iterations = max(rod.iterations for rod in rods)
+        self.drift = float(np.abs(self.scalars[4]).sum())
+        self.unstable_rods = tuple(i for i, count in enumerate(self.scalars[3].tolist()) if count)
+        units = robot.stiffnesses / robot.lengths**2
+        moves = self.load_tangents[:2].reshape(2, -1, 3)
+        self.force = read_only(self.loads[:2] @ units)
+        self.k = read_only(np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths))
+        self.g = read_only(moves[:, :, 2] * units)
+
+    def take(self, outputs: list[np.ndarray], iterations: int) -> None:
+        """Copy the results of `warm_step`, which found no conjugate point."""
+        (self.unknowns[:], self.tangents[:], self.poses[:], self.loads[:], self.load_tangents[:],
+         self.scalars[:]) = outputs[:6]  # fmt: skip
+        self.residual, _, _, _, self.drift = outputs[6].tolist()
+        self.force, self.k, self.g = (read_only(output.copy()) for output in outputs[7:])
+        self.iterations = iterations
+        self.unstable_rods = ()
+
+    def rods(self) -> list[RodState]:
+        """Split into rods."""
+        return [
+            RodState(
+                self.poses[:, i].copy(),
+                self.unknowns[:, i].copy(),
+                self.tangents[:, 3 * i : 3 * i + 3].copy(),
+                self.loads[:, i].copy(),
+                self.load_tangents[:, 3 * i : 3 * i + 3].copy(),
+                self.scalars[:, i].copy(),
+                self.residual,
+                self.iterations,
+            )
+            for i in range(self.poses.shape[1])
+        ]
