@@ -130,6 +130,7 @@ def test_a_failing_run_keeps_what_it_had(lemniscate, tmp_path):
         def __init__(self, plant):
             self.plant, self.count = plant, 0
             self.dt, self.method, self.integrator = plant.dt, plant.method, plant.integrator
+            self.snaps, self.rungs = plant.snaps, plant.rungs
 
         def reset(self, *arguments):
             self.plant.reset(*arguments)

@@ -52,8 +52,10 @@ class Run:
         Wall time of each control step: total, linearisation, QP update, QP solution [s].
     iterations : ndarray, shape (M,)
         Of OSQP.
+    rungs : dict
+        How many poses of the plant each rung of the statics' ladder has solved (see `RodSolver`).
     events : list of dict
-        Fall-backs and failures: time, kind, message.
+        Fall-backs, snaps and failures: time, kind, message.
     """
 
     scene: Scene
@@ -69,6 +71,7 @@ class Run:
     plant_time: np.ndarray
     control_time: np.ndarray
     iterations: np.ndarray
+    rungs: dict[str, int]
     events: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -147,8 +150,10 @@ class Run:
             },
             "peak_torque_Nm": self.peak_torque,
             "torque_limit_Nm": self.scene.robot.torque_limit,
+            "statics_rungs": self.rungs,
             "limit_violations": self.limit_violations(),
             "fallbacks": kinds.count("fallback"),
+            "snaps": kinds.count("snap"),
             "failures": kinds.count("failure"),
             "events": self.events,
             "run_hash": self.hash(),

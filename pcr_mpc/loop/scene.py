@@ -9,7 +9,7 @@ import numpy as np
 
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError
-from ..plant.dynamics import INTEGRATORS, Plant
+from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import forward_statics, inverse_statics
 from ..plant.robot import Robot, load_robot
@@ -32,6 +32,7 @@ class PlantSettings:
     scheme: str
     integrator: str
     dt: float
+    on_snap: str
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,7 @@ class Scene:
             scheme=settings.scheme,
             integrator=settings.integrator,
             dt=settings.dt,
+            on_snap=settings.on_snap,
         )
 
 
@@ -152,6 +154,7 @@ def load_scene(path: str | Path) -> Scene:
                 scheme=table.text("scheme", "rk8", choices=tuple(SCHEMES)),
                 integrator=table.text("integrator", choices=tuple(INTEGRATORS)),
                 dt=table.number("dt", above=0.0),
+                on_snap=table.text("on_snap", "raise", choices=ON_SNAP),
             )
         with file.table("control") as control:
             period = control.number("period", above=0.0)

@@ -57,7 +57,7 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
     iterations = np.zeros(n_periods, dtype=int)
     events: list[dict[str, Any]] = []
     states[0] = x
-    done, decided = 0, 0
+    done, decided, snapped = 0, 0, 0
 
     def record() -> Run:
         t = plant.dt * np.arange(done + 1)
@@ -76,6 +76,7 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
             plant_time=plant_time[:done].copy(),
             control_time=control_time[:decided].copy(),
             iterations=iterations[:decided].copy(),
+            rungs=plant.rungs,
             events=events,
         )
 
@@ -107,6 +108,16 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
                 plant_time[done] = time.perf_counter() - began
                 done += 1
                 states[done] = x
+                for snap in plant.snaps[snapped:]:
+                    events.append(
+                        {
+                            "t": done * plant.dt,
+                            "kind": "snap",
+                            "message": f"rod {snap.rod} snapped at p = {snap.p} m, q{snap.rod} = {snap.q:.4f} rad "
+                            f"and lost {snap.energy_lost:.4g} J",
+                        }
+                    )
+                snapped = len(plant.snaps)
     except (Exception, KeyboardInterrupt) as error:  # whatever it is, the run so far is kept
         what = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
         t = done * plant.dt

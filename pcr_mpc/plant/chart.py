@@ -29,7 +29,9 @@ _LAMBDA_STEPS = 480  # RK4 steps along each trajectory
 _COLUMNS = 96  # columns of the tabulated sheet
 _LAUNCH = 1e-4  # delta up to which the pendulum is linear to rounding
 _LOOPED = -13.0  # log(tip_angle) below which the chart stops short of the full loop where stability ends
+_VANISHES = -150.0  # log(tip_angle) below which the determinant is lost in rounding near the full loop
 _TAUT = -21.0  # log(tip_angle) below which that stretch is skipped
+_EDGE = 1e-9  # slack with which a triangle contains a point
 _POLISHED = 1e-12  # distance from the target, in units of L
 
 
@@ -124,15 +126,19 @@ def stable_shapes(xi: float, eta: float) -> list[HeldShape]:
 
 
 def critical_load(log_tip_angle: float) -> float:
-    """lambda_c, the load at which a rod with its tip held loses stability; inf beyond the chart's most taut rods."""
-    chart = _chart()
-    if log_tip_angle < _LOOPED:
-        return np.inf
-    guess = float(np.interp(log_tip_angle, chart.rows, chart.limits))
+    """lambda_c, the load at which a rod with its tip held loses stability."""
 
     def determinant(load: float) -> float:
         return float(np.linalg.det(_evaluate_tip(np.array([log_tip_angle, load]), np.zeros(2))[1]))
 
+    if log_tip_angle < _LOOPED:
+        # A full loop is about to leave a taut rod, a little short of 2 K(k).
+        full_loop = 2.0 * (np.log(8.0) - log_tip_angle)
+        if log_tip_angle < _VANISHES:
+            return float(full_loop - 0.55)
+        return float(brentq(determinant, full_loop - 0.8, full_loop - 0.3, xtol=1e-10))
+    chart = _chart()
+    guess = float(np.interp(log_tip_angle, chart.rows, chart.limits))
     # The table is good to a few per cent at most (where lambda_c jumps, between two of its rows).
     for width in (0.02, 0.1, 0.4):
         low, high = guess * (1 - width), guess * (1 + width)
@@ -154,7 +160,7 @@ def held_shapes(xi: float, eta: float) -> list[HeldShape]:
     found = []
     for hand in (1, -1):
         target = np.array([xi, hand * eta])
-        rows, weights = _containing(chart.triangles, target)
+        rows, weights = _containing(chart, target)
         for row, w in zip(rows, weights, strict=True):
             corners = chart.corners[row]
             values = (w @ field[corners] for field in (chart.log_tip_angle, chart.load, chart.energy))
@@ -189,6 +195,7 @@ class _Chart:
     energy: np.ndarray  # (M,)
     corners: np.ndarray  # (T, 3) indices of each triangle's corners
     triangles: np.ndarray  # (T, 3, 2) their positions
+    boxes: np.ndarray  # (4, T) least and greatest x, least and greatest y of each triangle
     rows: np.ndarray  # log tip_angle of each trajectory
     limits: np.ndarray  # its last stable load
 
@@ -213,13 +220,16 @@ def _chart() -> _Chart:
     index = np.arange(points.shape[0]).reshape(loads.shape)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     corners = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    triangles = points[corners]
+    low, high = triangles.min(axis=1) - _EDGE, triangles.max(axis=1) + _EDGE
     return _Chart(
         points=points,
         log_tip_angle=np.broadcast_to(log_tip_angle[:, None], loads.shape).ravel(),
         load=loads.ravel(),
         energy=columns[3].ravel(),
         corners=corners,
-        triangles=points[corners],
+        triangles=triangles,
+        boxes=np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]]),
         rows=log_tip_angle,
         limits=loads[:, -1],
     )
@@ -290,14 +300,18 @@ def _rk4(f: Callable[[Any], Any], state: Any, h: Any) -> Any:
     return state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def _containing(triangles: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _containing(chart: _Chart, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the triangles that contain ``target`` and its barycentric coordinates there."""
+    x, y = target
+    low_x, high_x, low_y, high_y = chart.boxes
+    rows = np.flatnonzero((low_x <= x) & (x <= high_x) & (low_y <= y) & (y <= high_y))
+    triangles = chart.triangles[rows]
     origin = triangles[:, 0]
     e1, e2, r = triangles[:, 1] - origin, triangles[:, 2] - origin, target - origin
     area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         w1 = (r[:, 0] * e2[:, 1] - r[:, 1] * e2[:, 0]) / area
         w2 = (e1[:, 0] * r[:, 1] - e1[:, 1] * r[:, 0]) / area
-        slack = 1e-9
-        inside = np.flatnonzero((w1 >= -slack) & (w2 >= -slack) & (w1 + w2 <= 1 + slack))
-    return inside, np.stack([1 - w1[inside] - w2[inside], w1[inside], w2[inside]], axis=1)
+        inside = (w1 >= -_EDGE) & (w2 >= -_EDGE) & (w1 + w2 <= 1 + _EDGE)
+    w1, w2 = w1[inside], w2[inside]
+    return rows[inside], np.stack([1 - w1 - w2, w1, w2], axis=1)

@@ -10,9 +10,10 @@ import numpy as np
 from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
 from .equilibrium import Equilibrium
 from .robot import Robot
-from .rod_solver import TOLERANCE
+from .rod_solver import Snap
 from .statics import checked_shooting, make_solver
 
+ON_SNAP = ("raise", "jump")
 # A simulation uses the derivatives only to predict the next pose.
 _PREDICTOR_ACCURACY = 1e-2
 # Relative drift of a rod's invariant beyond which its force may be off by per cents.
@@ -36,6 +37,10 @@ class Plant:
         classical fourth-order one with four.
     dt : float
         Step [s].
+    on_snap : {"raise", "jump"}
+        Where a rod's branch ends: `UnstableError`, or the rod falls at once to the stable shape that the descent of
+        its energy reaches, which is recorded in ``snaps`` with the energy lost (RK4 looks ahead within a step, so
+        that the tip position recorded may be off by that much).
 
     Notes
     -----
@@ -54,7 +59,10 @@ class Plant:
         scheme: str = "rk8",
         integrator: str = "semi_implicit_euler",
         dt: float = 1e-3,
+        on_snap: str = "raise",
     ) -> None:
+        if on_snap not in ON_SNAP:
+            raise ValueError(f"on_snap is {on_snap!r}, expected one of {', '.join(ON_SNAP)}")
         if integrator not in INTEGRATORS:
             raise ValueError(f"integrator is {integrator!r}, expected one of {', '.join(INTEGRATORS)}")
         if not 0.0 < dt < np.inf:
@@ -65,7 +73,7 @@ class Plant:
         self.dt = dt
         self.n_states = 4 + robot.n_rods
         self._advance = INTEGRATORS[integrator]
-        self._solver = make_solver(robot, method, checked_shooting(segments, steps, scheme))
+        self._solver = make_solver(robot, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
         self._at: tuple[float, ...] | None = None
         self._lower, self._upper = robot.angle_limits.T.copy()
 
@@ -79,7 +87,17 @@ class Plant:
             self._solver.start(p, q)
         else:
             self._solver.start(guess.p, guess.q, guess.nodes)
-        self._go(p, q, TOLERANCE)
+        self._go(p, q, None)
+
+    @property
+    def snaps(self) -> list[Snap]:
+        """Snaps since the reset, in order."""
+        return self._solver.snaps
+
+    @property
+    def rungs(self) -> dict[str, int]:
+        """How many poses each rung of the solver's ladder has solved (see `RodSolver`)."""
+        return dict(self._solver.rungs)
 
     def step(self, x: Any, u: Any, f_ext: Any = (0.0, 0.0)) -> np.ndarray:
         """Advance by one time step with the motor rates held.
@@ -123,11 +141,11 @@ class Plant:
         return self._solver.force()
 
     def force_and_jacobians(
-        self, p: np.ndarray, q: np.ndarray, accuracy: float = TOLERANCE
+        self, p: np.ndarray, q: np.ndarray, accuracy: float | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """F [N], K [N/m] and G [N/rad] at (p, q), following the branch.
 
-        ``accuracy`` bounds the residual of the iterate at which K and G were taken.
+        ``accuracy`` bounds the residual of the iterate at which K and G were taken; None: at the solution.
         """
         self._at = None  # the last solve may have been content with rougher derivatives
         self._go(p, q, accuracy)
@@ -138,10 +156,10 @@ class Plant:
         """Everything about the rods at state x, following the branch."""
         x = checked_vector("x", x, self.n_states)
         self._at = None
-        self._go(x[:2], x[4:], TOLERANCE)
+        self._go(x[:2], x[4:], None)
         return self._solver.equilibrium(x[:2], x[4:])
 
-    def _go(self, p: np.ndarray, q: np.ndarray, derivatives: float) -> None:
+    def _go(self, p: np.ndarray, q: np.ndarray, derivatives: float | None) -> None:
         at = (*p.tolist(), *q.tolist())
         if at == self._at:
             return

@@ -48,6 +48,8 @@ class Equilibrium:
         2-norm of the weighted residual (dimensionless).
     iterations : int
         Newton iterations of the slowest rod.
+    rung : str
+        Of the solver's ladder: "warm", "newton", "continuation", "snap" or "cold" (see `RodSolver`).
     drift : float
         Change of the invariant m^2/2 + n . t along the rods, over its size: the discretisation's own error estimate.
     unstable_rods : tuple of int
@@ -68,6 +70,7 @@ class Equilibrium:
     nodes: np.ndarray
     residual_norm: float
     iterations: int
+    rung: str
     drift: float
     unstable_rods: tuple[int, ...]
     converged: bool = True

@@ -47,6 +47,10 @@ class RodMethod:
     name : str
     newton, residual : casadi.Function
         See `multiple_shooting.rod_newton`.
+    tolerance : float
+        Residual at which a rod counts as solved: rounding.
+    following : float
+        Residual that will do from one time step of a simulation to the next.
     branch : slice
         The unknowns of order one that a warm start may not change much.
     from_shape : callable
@@ -60,6 +64,8 @@ class RodMethod:
     name: str
     newton: Any
     residual: Any
+    tolerance: float
+    following: float
     branch: slice
     from_shape: Callable[[HeldShape, float], np.ndarray]
     from_nodes: Callable[[np.ndarray], np.ndarray]
@@ -80,6 +86,9 @@ def shooting_method(shooting: Shooting) -> RodMethod:
         name="multiple_shooting",
         newton=newton,
         residual=residual,
+        # Relative to the load; on taut rods the equations have a condition of 1e8.
+        tolerance=1e-10,
+        following=1e-10,
         branch=slice(0, None, 4),
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
@@ -95,6 +104,8 @@ def closed_form_method() -> RodMethod:
         name="closed_form",
         newton=newton,
         residual=residual,
+        tolerance=1e-13,
+        following=1e-11,
         branch=slice(0, 2),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=elastica.from_nodes,

@@ -10,6 +10,9 @@ import numpy as np
 from ..frozen import read_only
 from .robot import Robot
 
+# How a pose was reached, from cheap to dear; see `RodSolver`.
+RUNGS = ("warm", "newton", "continuation", "cold", "snap")
+
 
 @dataclass(frozen=True, eq=False)
 class RodState:
@@ -23,6 +26,17 @@ class RodState:
     scalars: np.ndarray  # (5,) residual, step length, energy, conjugate points, drift
     residual: float
     iterations: int
+    rung: str = "newton"
+
+    @property
+    def stable(self) -> bool:
+        """Whether there is no conjugate point along the rod."""
+        return not self.scalars[3]
+
+    @property
+    def energy(self) -> float:
+        """Elastic energy in EI/L."""
+        return float(self.scalars[2])
 
 
 class RobotState:
@@ -37,6 +51,7 @@ class RobotState:
         self.scalars = np.stack([rod.scalars for rod in rods], axis=1)
         self.residual = math.hypot(*(rod.residual for rod in rods))
         self.iterations = max(rod.iterations for rod in rods)
+        self.rung = max((rod.rung for rod in rods), key=RUNGS.index)
         self.drift = float(np.abs(self.scalars[4]).sum())
         self.unstable_rods = tuple(i for i, count in enumerate(self.scalars[3].tolist()) if count)
         units = robot.stiffnesses / robot.lengths**2
@@ -52,6 +67,7 @@ class RobotState:
         self.residual, _, _, _, self.drift = outputs[6].tolist()
         self.force, self.k, self.g = (read_only(output.copy()) for output in outputs[7:])
         self.iterations = iterations
+        self.rung = "warm"
         self.unstable_rods = ()
 
     def rods(self) -> list[RodState]:
@@ -66,6 +82,7 @@ class RobotState:
                 self.scalars[:, i].copy(),
                 self.residual,
                 self.iterations,
+                self.rung,
             )
             for i in range(self.poses.shape[1])
         ]

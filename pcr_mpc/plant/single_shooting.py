@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import lru_cache
 from typing import Any
 
@@ -62,6 +63,8 @@ class SingleShooting:
         self._evaluate = BufferedFunction(_residual_and_jacobians(robot, steps, scheme))
         self._units = np.stack([robot.stiffnesses / robot.lengths**e for e in (2, 2, 1)], axis=1)
         self._judge = BufferedFunction(_judge(steps, scheme))
+        self.snaps: list[Any] = []  # none is ever noticed
+        self.rungs: Counter[str] = Counter()
         self._last: Equilibrium | None = None
         self._before: Equilibrium | None = None
 
@@ -69,7 +72,7 @@ class SingleShooting:
         """Solve at (p, q) from the base states of ``nodes``, shape (n, 4, N), or cold (None)."""
         self._last = self._solve(p, q, np.stack(self._cold(p, q)) if nodes is None else nodes)
 
-    def move(self, p: np.ndarray, q: np.ndarray, *, derivatives: float = 0.0) -> None:
+    def move(self, p: np.ndarray, q: np.ndarray, *, derivatives: float | None = None) -> None:
         """Solve at (p, q) from the last pose. The derivatives always belong to the solution."""
         last = self._solution()
         self._last, self._before = self._solve(p, q, last.nodes), last
@@ -148,6 +151,7 @@ class SingleShooting:
                 iterations=evaluations,
                 last=y,
             )
+        self.rungs["newton"] += 1
         # Implicit function theorem: dY/d(p, q) = -(dR/dY)^-1 dR/d(p, q), one factorisation for all columns.
         sensitivity = -np.linalg.solve(evaluate.outputs[1], evaluate.outputs[2])
         base_loads = y[:-2].reshape(n, 3)
@@ -173,6 +177,7 @@ class SingleShooting:
             nodes=solved,
             residual_norm=norm,
             iterations=evaluations,
+            rung="newton",
             drift=float(np.abs(scalars[:, 2]).max()),
             unstable_rods=tuple(int(i) for i in np.flatnonzero(scalars[:, 1] > 0)),
         )

@@ -138,13 +138,15 @@ def _solver(robot: Robot, method: str, shooting: Shooting, thread: int) -> RodSo
     return make_solver(robot, method, shooting)
 
 
-def make_solver(robot: Robot, method: str, shooting: Shooting) -> RodSolver | SingleShooting:
+def make_solver(robot: Robot, method: str, shooting: Shooting, *, snapping: bool = False) -> RodSolver | SingleShooting:
     """Build the solver that goes by the name ``method``."""
     if method == "closed_form":
-        return RodSolver(robot, closed_form_method())
+        return RodSolver(robot, closed_form_method(), snapping=snapping)
     if method == "multiple_shooting":
-        return RodSolver(robot, shooting_method(shooting))
+        return RodSolver(robot, shooting_method(shooting), snapping=snapping)
     if method == "single_shooting":
+        if snapping:
+            raise ValueError("single shooting does not notice where a branch ends: on_snap='jump' needs another method")
         return SingleShooting(robot, shooting.segments * shooting.steps, shooting.scheme)
     raise ValueError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
 

@@ -1,0 +1,193 @@
+"""One rod, from one pose to the next: every rung of the ladder but the cheapest."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ..buffered import BufferedFunction
+from ..errors import ConvergenceError
+from . import elastica
+from .chart import critical_load, held_shapes
+from .rod_method import RodMethod
+from .rod_state import RodState
+from .snap import landing
+
+MAX_ITERATIONS = 60
+# A warm start that needs more is better served by a smaller sub-step.
+_WARM_ITERATIONS = 8
+# A warm start whose unknowns move further than this beyond the prediction may have left its branch.
+BRANCH_CHANGE = 0.3
+# A rod that can be followed no further with less than this left to lambda_c has come to a fold.
+_FOLD_MARGIN = 0.15
+_SMALLEST_SUBSTEP = 1.0 / 1024.0
+_SNAP_NODES = 64
+_FURTHEST = 0.1  # from a fold, in units of L and rad, at which its shape is sought to be gone
+
+
+class NotConverged(Exception):
+    """Newton's method failed: where it stood."""
+
+    def __init__(self, residual: float, iterations: int, unknowns: np.ndarray, reason: str) -> None:
+        super().__init__(reason)
+        self.residual, self.iterations, self.unknowns = residual, iterations, unknowns
+
+
+class BranchEnds(NotConverged):
+    """It failed because the rod has come to a fold: how far it came, how short of the limit, and the next step."""
+
+    def __init__(self, failure: NotConverged, last: RodState, margin: float, step: np.ndarray) -> None:
+        super().__init__(failure.residual, failure.iterations, failure.unknowns, str(failure))
+        self.last, self.margin, self.step = last, margin, step
+
+
+class RodFollower:
+    """Solves single rods, normalised, by one method.
+
+    Parameters
+    ----------
+    method : RodMethod
+    """
+
+    def __init__(self, method: RodMethod) -> None:
+        self.method = method
+        self._newton = BufferedFunction(method.newton)
+        self._check = BufferedFunction(method.residual)
+
+    def cold(self, pose: np.ndarray) -> RodState:
+        """Stable shape of least energy."""
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        xi, eta = cos * pose[0] + sin * pose[1], cos * pose[1] - sin * pose[0]
+        last = NotConverged(math.nan, 0, pose, "no stable shape found")
+        for coarse in held_shapes(xi, eta):
+            shape = coarse.polished(xi, eta) or coarse
+            try:
+                state = self.solve(pose, self.method.from_shape(shape, pose[2]))
+            except NotConverged as failure:
+                last = failure
+                continue
+            if state.stable:
+                return replace(state, rung="cold")
+            last = NotConverged(state.residual, state.iterations, state.unknowns, "found only unstable shapes")
+        raise last
+
+    def follow(
+        self, start: RodState, pose: np.ndarray, derivatives: float | None = None, *, continuation: bool = True
+    ) -> RodState:
+        """Keep to the branch of ``start`` up to ``pose``: damped Newton from the prediction, or continuation."""
+        try:
+            return self._predict(start, pose, derivatives)
+        except NotConverged as failure:
+            if not continuation:
+                raise
+            first = failure
+        # Continuation along the straight line from the last pose, sub-steps halved and doubled as they go.
+        state, done, substep = start, 0.0, 0.5
+        while done < 1.0:
+            target = 1.0 if done + substep >= 1.0 else done + substep
+            try:
+                state = self._predict(state, start.pose + target * (pose - start.pose), None)
+            except NotConverged:
+                substep /= 2
+                if substep < _SMALLEST_SUBSTEP:
+                    margin = self._margin(state)
+                    if margin > _FOLD_MARGIN:
+                        raise first from None
+                    raise BranchEnds(first, state, margin, 2 * substep * (pose - start.pose)) from None
+            else:
+                done, substep = target, 2 * substep
+        return replace(state, rung="continuation")
+
+    def snap(self, fold: BranchEnds) -> RodState:
+        """Stable shape to which the rod descends where its branch ends."""
+        last, branch = fold.last, self.method.branch
+        nodes = self.method.to_nodes(last.unknowns, last.pose[2], _SNAP_NODES)
+        # Just beyond the fold the slope is hardly one, and a chain of links folds a little later than a rod: look
+        # further and further until the shape is gone, and come back along the shape that is found.
+        distance = 1.0
+        while distance * np.abs(fold.step).max() < _FURTHEST:
+            pose = last.pose + distance * fold.step
+            distance *= 2.0
+            try:
+                state = self.solve(pose, self.method.from_nodes(landing(nodes, pose)))
+                elsewhere = np.abs((state.unknowns - last.unknowns)[branch]).max() > BRANCH_CHANGE
+                if elsewhere and state.stable and state.energy < last.energy:
+                    return replace(self.follow(state, last.pose + fold.step), rung="snap")
+            except (NotConverged, ConvergenceError):
+                continue
+        raise NotConverged(fold.residual, fold.iterations, last.unknowns, "nowhere lower to snap to")
+
+    @np.errstate(all="ignore")  # an overflow is a bad trial point, and rejected
+    def solve(
+        self, pose: np.ndarray, unknowns: np.ndarray, derivatives: float | None = None, most: int = MAX_ITERATIONS
+    ) -> RodState:
+        """Damped Newton from ``unknowns``; ``derivatives`` as in `RodSolver.move`.
+
+        A step is kept if the next Newton step is shorter or the residual smaller. The residual alone will not
+        do: on a taut rod (condition 1e8) it rises by orders of magnitude on a step that lands next to the
+        solution.
+        """
+        newton, check, solved = self._newton, self._check, self.method.tolerance
+        newton.inputs[0][:] = unknowns
+        newton.inputs[1][:] = check.inputs[1][:] = pose
+        newton()
+        step, scalars = newton.outputs[0], newton.outputs[4]
+        for iteration in range(1, most + 1):
+            residual, length = scalars[0], scalars[1]
+            if residual <= solved:
+                return self._state(pose, unknowns, newton.outputs[2], residual, iteration)
+            if derivatives is not None and residual <= derivatives:
+                trial = unknowns + step
+                check.inputs[0][:] = trial
+                check()
+                if check.outputs[0][0] <= self.method.following:
+                    return self._state(pose, trial, check.outputs[1], check.outputs[0][0], iteration)
+            direction, size = step.copy(), 1.0
+            while True:
+                newton.inputs[0][:] = trial = unknowns + size * direction
+                newton()
+                # Written so that NaN is a failure.
+                if (
+                    scalars[0] <= max((1.0 - 0.1 * size) * residual, solved)
+                    or scalars[1] <= (1.0 - 0.25 * size) * length
+                ):
+                    break
+                size /= 2
+                if size < 1e-3:
+                    raise NotConverged(residual, iteration, unknowns, "no descent")
+            unknowns = trial
+        raise NotConverged(scalars[0], most, unknowns, "too many iterations")
+
+    def _margin(self, state: RodState) -> float:
+        """1 - lambda / lambda_c."""
+        nodes = self.method.to_nodes(state.unknowns, state.pose[2], _SNAP_NODES)
+        log_tip_angle, load, _ = elastica.from_nodes(nodes)
+        return 1.0 - float(load) / critical_load(float(log_tip_angle))
+
+    def _predict(self, start: RodState, pose: np.ndarray, derivatives: float | None) -> RodState:
+        predicted = start.unknowns + start.tangent @ (pose - start.pose)
+        state = self.solve(pose, predicted, derivatives, _WARM_ITERATIONS)
+        branch = self.method.branch
+        if np.abs(state.unknowns[branch] - predicted[branch]).max() > BRANCH_CHANGE:
+            raise NotConverged(state.residual, state.iterations, state.unknowns, "left its branch")
+        # A stable branch does not turn unstable: it ends, and Newton's method landed on its other side.
+        if start.stable and not state.stable:
+            raise NotConverged(state.residual, state.iterations, state.unknowns, "walked through a fold")
+        return state
+
+    def _state(
+        self, pose: np.ndarray, unknowns: np.ndarray, loads: np.ndarray, residual: float, iterations: int
+    ) -> RodState:
+        _, tangent, _, load_tangent, scalars = self._newton.outputs
+        return RodState(
+            pose,
+            unknowns,
+            tangent.copy(),
+            loads.copy(),
+            load_tangent.copy(),
+            scalars.copy(),
+            float(residual),
+            iterations,
+        )
