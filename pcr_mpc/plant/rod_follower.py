@@ -137,7 +137,9 @@ class RodFollower:
         for iteration in range(1, most + 1):
             residual, length = scalars[0], scalars[1]
             if residual <= solved:
-                return self._state(pose, unknowns, newton.outputs[2], residual, iteration)
+                if derivatives is None:
+                    unknowns = self._polish(unknowns)
+                return self._state(pose, unknowns, newton.outputs[2], scalars[0], iteration)
             if derivatives is not None and residual <= derivatives:
                 trial = unknowns + step
                 check.inputs[0][:] = trial
@@ -159,6 +161,19 @@ class RodFollower:
                     raise NotConverged(residual, iteration, unknowns, "no descent")
             unknowns = trial
         raise NotConverged(scalars[0], most, unknowns, "too many iterations")
+
+    def _polish(self, unknowns: np.ndarray) -> np.ndarray:
+        """One more Newton step, if it gains anything: near a fold each digit of the residual counts."""
+        newton = self._newton
+        residual = newton.outputs[4][0]
+        newton.inputs[0][:] = better = unknowns + newton.outputs[0]
+        newton()
+        # Written so that NaN is a failure.
+        if newton.outputs[4][0] <= residual:
+            return better
+        newton.inputs[0][:] = unknowns
+        newton()
+        return unknowns
 
     def _margin(self, state: RodState) -> float:
         """1 - lambda / lambda_c."""
