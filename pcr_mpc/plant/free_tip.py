@@ -18,7 +18,10 @@ from .rod_solver import RodSolver
 
 _MAX_ITERATIONS = 100
 _FORCE_TOLERANCE = 1e-9  # of the robot's force scale, sum EI/L^2
+_RESOLUTION = 1e-12  # of the tip position, in rod lengths
 _ANGLE_STEP = 0.25  # largest motor step of a continuation [rad]
+_SMALLEST_STEP = 1e-5  # of a continuation, as a fraction of the way
+_FOLD_STIFFNESS = 0.05  # smallest over largest eigenvalue of K: one that ends there has come to a fold
 _TIP_STEP = 0.05  # largest tip step of a continuation, in rod lengths
 _OFFSETS = np.linspace(-2.6, 2.6, 40)  # clamp angle minus chord angle, of a cold inverse start [rad]
 _CANDIDATES = 24
@@ -53,12 +56,7 @@ def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equili
     q, force = checked_vector("q", q, robot.n_rods), checked_vector("force", force, 2)
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
-        solver.start(guess.p, guess.q, guess.nodes)
-        n_steps = int(np.ceil(np.abs(q - guess.q).max() / _ANGLE_STEP)) + 1
-        p = guess.p
-        for t in np.linspace(0.0, 1.0, n_steps + 1)[1:]:
-            p = settle(solver, p, guess.q + t * (q - guess.q), guess.force + t * (force - guess.force))
-        return solver.equilibrium(p, q)
+        return _follow(solver, guess, q, force)
     found: list[Equilibrium] = []
     last: PCRError | None = None
     for start in _tip_starts(robot, q):
@@ -142,7 +140,6 @@ def inverse_statics(
 def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Descend the potential energy U(p, q) - force . p to a stable pose, by Newton's method with a bounded step."""
     robot = solver.robot
-    tolerance = _FORCE_TOLERANCE * _force_scale(robot)
     solver.move(p, q)
     energy = solver.energy() - force @ p
     radius = 0.1 * robot.lengths.min()
@@ -150,6 +147,8 @@ def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -
         residual = solver.force() - force
         stiffness, _ = solver.jacobians()
         values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
+        # No better than the tip position is resolved, which counts where rods are nearly straight.
+        tolerance = _FORCE_TOLERANCE * _force_scale(robot) + _RESOLUTION * float(robot.lengths.max() * values[-1])
         if np.linalg.norm(residual) <= tolerance:
             if values[0] <= 0 or solver.unstable_rods():
                 raise UnstableError(
@@ -192,6 +191,45 @@ def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -
         iterations=_MAX_ITERATIONS,
         last=p,
     )
+
+
+def _follow(solver: RodSolver, guess: Equilibrium, q: np.ndarray, force: np.ndarray) -> Equilibrium:
+    """Follow the balanced tip from ``guess`` to (q, force), in sub-steps where one step fails."""
+    robot, eq, done = solver.robot, guess, 0.0
+    largest = substep = min(1.0, _ANGLE_STEP / max(float(np.abs(q - guess.q).max()), _ANGLE_STEP))
+    near = _TIP_STEP * float(robot.lengths.min())
+    while done < 1.0:
+        target = 1.0 if done + substep >= 1.0 else done + substep
+        at_q, at_force = guess.q + target * (q - guess.q), guess.force + target * (force - guess.force)
+        solver.start(eq.p, eq.q, eq.nodes)
+        try:
+            predicted = eq.p + np.linalg.solve(eq.dforce_dp, at_force - eq.force - eq.dforce_dq @ (at_q - eq.q))
+            robot.require_reachable(predicted)
+            p = settle(solver, predicted, at_q, at_force)
+            if np.linalg.norm(p - predicted) > near:
+                raise UnstableError(
+                    f"the tip leaves its branch near p = {eq.p} m, q = {eq.q} rad: from there it falls to p = {p} m; "
+                    "choose other motor angles, or a guess on another branch",
+                    eigenvalue=float(eq.stiffness_eigenvalues[0]),
+                    p=eq.p,
+                    q=eq.q,
+                )
+        except PCRError as error:
+            substep /= 2
+            if substep < _SMALLEST_STEP:
+                if eq.stiffness_eigenvalues[0] < _FOLD_STIFFNESS * eq.stiffness_eigenvalues[1]:
+                    raise UnstableError(
+                        f"the branch of the guess ends at a fold: at {100 * done:.1f} % of the way, p = {eq.p} m, "
+                        f"q = {eq.q} rad, the smallest stiffness is down to {eq.stiffness_eigenvalues[0]:.3g} N/m, and "
+                        "the tip would snap to another pose; choose other motor angles, or a guess on another branch",
+                        eigenvalue=float(eq.stiffness_eigenvalues[0]),
+                        p=eq.p,
+                        q=eq.q,
+                    ) from error
+                raise
+        else:
+            eq, done, substep = solver.equilibrium(p, at_q), target, min(2 * substep, largest)
+    return eq
 
 
 def _require_usable(eq: Equilibrium) -> None:
