@@ -3,7 +3,8 @@
 For tip positions from gently bent to nearly straight rods, the default robot rests in balance without drag and is
 nudged by 1 um; the largest dt at which 400 steps stay bounded is found by bisection and compared with the prediction
 omega dt = 2 (semi-implicit Euler, velocity Verlet) or 2 sqrt(2) (RK4), omega^2 the largest eigenvalue of K/m.
-Poses for which no balance is found are rows too. Writes a CSV and a picture.
+Poses for which no balance is found are rows too. Then the energy of two seconds of free swinging, which no integrator
+keeps exactly, against dt. Writes two CSVs and two pictures.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, plt
 
 PREDICTED = {"semi_implicit_euler": 2.0, "velocity_verlet": 2.0, "rk4": 2.0 * np.sqrt(2.0)}
 COLOURS = {"semi_implicit_euler": BLUE, "velocity_verlet": ORANGE, "rk4": GREEN}
+ORDERS = {"semi_implicit_euler": 1, "velocity_verlet": 2, "rk4": 5}  # of the energy (RK4 damps)
+SWING, DURATION = (0.3, -0.2), 2.0  # tip velocity [m/s] and length [s] of the swing
 STEPS, NUDGE, BOUND = 400, 1e-6, 1e-4  # number, m, m
 
 
@@ -62,6 +65,48 @@ def measure(robot: Robot, heights: np.ndarray) -> list[dict[str, object]]:
             limit = {"omega": omega, "dt": low, "omega_dt": omega * low}
             rows.append({"stretch": stretch, "integrator": integrator, **limit, "failure": ""})
     return rows
+
+
+def swing(robot: Robot, integrator: str, dt: float) -> dict[str, object]:
+    """Largest and final change of the energy of a swinging tip, relative to what it swings with."""
+    pose = inverse_statics(robot, (0.0, 0.25), mode="LR")
+    plant = Plant(robot, integrator=integrator, dt=dt)
+    x = np.concatenate([pose.p, SWING, pose.q])
+    plant.reset(x, pose)
+    row: dict[str, object] = {"integrator": integrator, "dt": dt, "largest": "", "final": "", "failure": ""}
+    given = 0.5 * robot.tip_mass * float(np.dot(SWING, SWING))
+    changes = []
+    try:
+        for _ in range(round(DURATION / dt)):
+            x = plant.step(x, np.zeros(robot.n_rods))
+            kinetic = 0.5 * robot.tip_mass * float(x[2:4] @ x[2:4])
+            changes.append((kinetic + plant.equilibrium(x).energy - pose.energy) / given - 1.0)
+    except PCRError as error:
+        row["failure"] = str(error)
+    else:
+        row |= {"largest": float(np.abs(changes).max()), "final": abs(changes[-1])}
+    return row
+
+
+def plot_energy(rows: list[dict[str, object]], path: Path) -> None:
+    """Largest change of the energy against dt, with the slopes of theory."""
+    figure, axes = plt.subplots(figsize=(6, 4))
+    for integrator, order in ORDERS.items():
+        mine = [row for row in rows if row["integrator"] == integrator and row["largest"] != ""]
+        dt = 1e3 * np.array([row["dt"] for row in mine], dtype=float)
+        largest = np.array([row["largest"] for row in mine], dtype=float)
+        axes.loglog(dt, largest, "o-", color=COLOURS[integrator], ms=4, label=integrator.replace("_", " "))
+        axes.loglog(dt, largest[-1] * (dt / dt[-1]) ** order, ":", color=GREY)
+        axes.annotate(f"order {order}", (dt[-2], largest[-2]), xytext=(0, -14), textcoords="offset points", color=GREY)
+    axes.set(
+        xlabel="dt [ms]", ylabel="largest change of energy / energy of the swing", title="Free swing of 2 s, no drag"
+    )
+    axes.set_xticks(dt, [f"{value:g}" for value in dt])
+    axes.minorticks_off()
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)
 
 
 def plot(rows: list[dict[str, object]], path: Path) -> None:
@@ -107,11 +152,15 @@ def main() -> None:
     robot = replace(load_robot(Path(__file__).parent.parent / "models" / "planar_pair.toml"), drag=0.0)
     stretches = np.concatenate([np.linspace(0.45, 0.9, 7), [0.93, 0.96, 0.98, 0.99, 0.995, 0.998, 0.999]])
     rows = measure(robot, np.sqrt((0.4 * stretches) ** 2 - 0.1**2))
-    with open(folder / "time_step_limits.csv", "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    steps = [2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3, 8e-3]
+    swings = [swing(robot, integrator, dt) for dt in tqdm(steps, desc="swings", unit="dt") for integrator in PREDICTED]
+    for name, table in (("time_step_limits", rows), ("energy_drift", swings)):
+        with open(folder / f"{name}.csv", "w", newline="", encoding="utf-8") as handle:
+            writer = csv.DictWriter(handle, fieldnames=list(table[0]))
+            writer.writeheader()
+            writer.writerows(table)
     plot(rows, folder / "time_step_limits.png")
+    plot_energy(swings, folder / "energy_drift.png")
     print(f"written to {folder}")
 
 

@@ -44,6 +44,7 @@ def test_mirrored_poses_have_the_same_radius(pair, centre):
     assert radii[0] == pytest.approx(radii[1], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_quick_run(tmp_path):
     main(["--quick", "--out", str(tmp_path)])
     rows = {}
