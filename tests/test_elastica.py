@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from pcr_mpc import solve_statics
 from pcr_mpc.plant import elastica
 from pcr_mpc.plant.chart import held_shapes
 from pcr_mpc.plant.rod import sample_rod
@@ -87,6 +88,18 @@ def test_unknowns_from_nodes(unknowns):
     """A start from nodes keeps the hand, also of a taut rod clamped against the pull (delta beyond pi)."""
     states = elastica.nodes(np.array(unknowns), 0.7, 8)
     assert elastica.from_nodes(states) == pytest.approx(unknowns, abs=0.05)
+
+
+@pytest.mark.parametrize("move", [(0.0, -0.02), (0.02, -0.006), (-0.02, -0.006)])
+def test_nearly_straight_rods_are_followed(pair, move):
+    """Gently loaded rods swing from pulled to pushed within micrometres of the tip; here over 20 mm in one call."""
+    start = solve_statics(pair, (0.0221, 0.3785), (1.453, 1.199))
+    assert np.linalg.norm(start.rod_forces, axis=1).max() < 2.0
+    once = solve_statics(pair, start.p + move, start.q, guess=start)
+    stepwise = start
+    for t in np.linspace(0, 1, 101)[1:]:
+        stepwise = solve_statics(pair, start.p + t * np.array(move), start.q, guess=stepwise)
+    assert once.force == pytest.approx(stepwise.force, rel=1e-9)
 
 
 def test_chart_finds_the_shapes_it_is_made_of():

@@ -107,3 +107,14 @@ def test_three_rods(poses):
     plant.reset(x)
     model = linearise(plant, x, np.zeros(3), 0.01)
     assert (model.A.shape, model.B.shape, model.c.shape) == ((7, 7), (7, 3), (7,))
+
+
+def test_effect_of_a_force(pair, centre):
+    """E is what the constant of the model gains from an external force."""
+    plant = Plant(pair)
+    x = np.concatenate([centre.p, [0.1, -0.2], centre.q])
+    plant.reset(x, centre)
+    force = np.array([0.7, -1.3])
+    without, with_force = linearise(plant, x, [0, 0], 0.01), linearise(plant, x, [0, 0], 0.01, f_ext=force)
+    assert with_force.c - without.c == pytest.approx(without.E @ force, abs=1e-11)
+    assert without.E[0, 0] == pytest.approx(0.5 * 0.01**2 / pair.tip_mass, rel=0.02)

@@ -15,11 +15,15 @@ from ..frozen import freeze
 class LinearModel:
     """Affine discrete-time model x+ = A x + B u + c with x = [p, v, q] and u held over dt.
 
+    The external force that it was made for is in c; a further force f adds E f.
+
     Attributes
     ----------
     A : ndarray, shape (4 + n, 4 + n)
     B : ndarray, shape (4 + n, n)
     c : ndarray, shape (4 + n,)
+    E : ndarray, shape (4 + n, 2)
+        Effect of a constant force on the tip [m/N], [m/s/N], 0.
     dt : float
         Period [s].
     """
@@ -27,6 +31,7 @@ class LinearModel:
     A: np.ndarray
     B: np.ndarray
     c: np.ndarray
+    E: np.ndarray
     dt: float
 
     def __post_init__(self) -> None:

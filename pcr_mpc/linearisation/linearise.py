@@ -67,13 +67,13 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     function.inputs[3][:] = x
     function.inputs[4][:] = plant.robot.tip_mass, plant.robot.drag, dt
     function()
-    a, b, c = (output.copy() for output in function.outputs)
-    return LinearModel(a, b, c, dt)
+    a, b, c, e = (output.copy() for output in function.outputs)
+    return LinearModel(a, b, c, e, dt)
 
 
 @lru_cache(maxsize=32)
 def _discretisation(n: int, thread: int) -> BufferedFunction:
-    """Exact discretisation as one graph: (K, G, F - F_ext, x, [m, c, dt]) -> (A, B, c)."""
+    """Exact discretisation as one graph: (K, G, F - F_ext, x, [m, c, dt]) -> (A, B, c, E)."""
     k, g, force = ca.SX.sym("K", 2, 2), ca.SX.sym("G", 2, n), ca.SX.sym("F", 2)
     x, parameters = ca.SX.sym("x", 4 + n), ca.SX.sym("parameters", 3)
     mass, drag, dt = ca.vertsplit(parameters)
@@ -113,6 +113,6 @@ def _discretisation(n: int, thread: int) -> BufferedFunction:
     state = ca.vertcat(0, 0, dt * x[2], dt * x[3])
     moved = exponential @ state - scale * ca.mtimes(phi_1, force)
     c_vector = ca.vertcat(p + moved[:2], moved[2:] / dt, q) - a_matrix @ x
-    return BufferedFunction(
-        ca.Function("discretise", [k, g, force, x, parameters], [a_matrix, b_matrix, c_vector], {"cse": True})
-    )
+    e_matrix = ca.vertcat(ca.diag(units) @ (scale * phi_1), ca.SX(n, 2))
+    results = [a_matrix, b_matrix, c_vector, e_matrix]
+    return BufferedFunction(ca.Function("discretise", [k, g, force, x, parameters], results, {"cse": True}))

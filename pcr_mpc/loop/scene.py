@@ -64,6 +64,10 @@ class Scene:
         External force on the tip, unknown to the controller [N].
     tip_noise : float
         Standard deviation of the measured tip position [m].
+    angle_step : float
+        Resolution of the encoders: measured angles are whole multiples of it [rad]. Zero: exact.
+    delay : int
+        Control periods that pass before a command reaches the motors.
     """
 
     name: str
@@ -79,6 +83,8 @@ class Scene:
     tuning: Tuning | None
     force: tuple[float, float]
     tip_noise: float
+    angle_step: float = 0.0
+    delay: int = 0
 
     @property
     def n_periods(self) -> int:
@@ -159,6 +165,7 @@ def load_scene(path: str | Path) -> Scene:
         with file.table("control") as control:
             period = control.number("period", above=0.0)
             tuning = control.text("tuning", None)
+            delay = control.integer("delay", 0, minimum=0)
             ratio = period / plant.dt
             if duration < period:
                 raise control.fail("period", f"is {period} s, longer than the duration {duration} s")
@@ -167,10 +174,11 @@ def load_scene(path: str | Path) -> Scene:
         with file.table("load", {}) as load, file.table("sensor", {}) as sensor:
             force = load.vector("force", 2, (0.0, 0.0))
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
+            angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
         with file.table("reference") as reference:
             trajectory = _trajectory(reference)
     scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
-                  tuning and load_tuning(file.path.parent / tuning), force, noise)  # fmt: skip
+                  tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step, delay)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,7 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
     plant.reset(x, pose)
     controller.start(pose)
     noise = np.random.default_rng(seed)
+    on_the_way = deque([np.zeros(scene.robot.n_rods)] * scene.delay)
     n_periods, n = scene.n_periods, scene.robot.n_rods
 
     states = np.empty((n_periods * per + 1, len(x)))
@@ -85,11 +87,15 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
             measured = x.copy()
             if scene.tip_noise:
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
+            if scene.angle_step:
+                measured[4:] = scene.angle_step * np.round(measured[4:] / scene.angle_step)
             began = time.perf_counter()
             decision = controller.step(k, measured)
             control_time[k, 0] = time.perf_counter() - began
             inputs[k] = decision.u
             decided = k + 1
+            on_the_way.append(decision.u)
+            arrived = on_the_way.popleft()
             if decision.plan is not None:
                 plan = decision.plan
                 control_time[k, 1:] = decision.linearise_time, plan.update_time, plan.solve_time
@@ -104,7 +110,7 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
                     )
             for _ in range(per):
                 began = time.perf_counter()
-                x = plant.step(x, decision.u, scene.force)
+                x = plant.step(x, arrived, scene.force)
                 plant_time[done] = time.perf_counter() - began
                 done += 1
                 states[done] = x

@@ -24,6 +24,7 @@ from .rod import sample_rod
 # Ascending Landen steps: k' falls below 1e-16 from any k >= 1e-6.
 _LANDEN_STEPS = 8
 _SWEEP = 60  # points along the rod at which conjugate points are looked for
+_GENTLE = 2.0  # load below which steps are taken in the components of the force
 # Angles below this, taken from nodes, are not trusted.
 _ROUNDING = 1e-5
 
@@ -118,26 +119,40 @@ def rod_newton() -> tuple[Any, Any]:
 
 
 @lru_cache
-def _nodes(n_nodes: int) -> Any:
-    unknowns, angle = ca.SX.sym("unknowns", 3), ca.SX.sym("angle")
-    hand, load = unknowns[2], unknowns[1]
-    states = [pendulum(unknowns[0], load * (1 - j / n_nodes))[:2] for j in range(n_nodes)]
-    base = states[0][0]
-    columns = [
-        ca.vertcat(
-            angle + hand * (base - delta),
-            load**2 * ca.cos(angle + hand * base),
-            load**2 * ca.sin(angle + hand * base),
-            hand * load * rate,
-        )
-        for delta, rate in states
-    ]
-    return ca.Function("nodes", [unknowns, angle], [ca.horzcat(*columns)], {"cse": True})
+def _pendulums(count: int) -> Any:
+    log_tip_angle, u = ca.SX.sym("log_tip_angle"), ca.SX.sym("u")
+    return ca.Function("pendulum", [log_tip_angle, u], list(pendulum(log_tip_angle, u)[:2])).map(count)
 
 
 def nodes(unknowns: np.ndarray, angle: float, n_nodes: int) -> np.ndarray:
     """States [theta, n_x, n_y, m] at s = j/n_nodes, shape (4, n_nodes), normalised."""
-    return np.asarray(_nodes(n_nodes)(unknowns, angle).full())
+    log_tip_angle, load, hand = unknowns
+    u = load * (1.0 - np.arange(n_nodes) / n_nodes)
+    delta, rate = (result.full().ravel() for result in _pendulums(n_nodes)(log_tip_angle, u[None]))
+    psi = angle + hand * delta[0]
+    force = load**2 * np.array([[np.cos(psi)], [np.sin(psi)]])
+    return np.vstack([angle + hand * (delta[0] - delta), np.repeat(force, n_nodes, axis=1), hand * load * rate])
+
+
+@lru_cache
+def retraction() -> Any:
+    """Graph (unknowns, change) -> unknowns: how a step of Newton's method or a prediction is taken.
+
+    On gently loaded rods (log tip_angle, lambda) are bad polar coordinates of the tip force, which swings about zero
+    as a nearly straight rod is pulled and pushed; there the step goes straight on in its components along and across
+    the tip's tangent.
+    """
+    unknowns, change = ca.SX.sym("unknowns", 3), ca.SX.sym("change", 3)
+    tip_angle, load, hand = ca.exp(unknowns[0]), unknowns[1], unknowns[2]
+    along, across = load**2 * ca.cos(tip_angle), hand * load**2 * ca.sin(tip_angle)
+    turn = tip_angle * change[0]
+    along += 2 * load * ca.cos(tip_angle) * change[1] - hand * across * turn
+    across += hand * (2 * load * ca.sin(tip_angle) * change[1] + load**2 * ca.cos(tip_angle) * turn)
+    gentle = ca.vertcat(
+        ca.log(ca.atan2(ca.fabs(across), along)), ca.sqrt(ca.sqrt(along**2 + across**2)), ca.if_else(across < 0, -1, 1)
+    )
+    taken = ca.if_else(load < _GENTLE, gentle, unknowns + change)
+    return ca.Function("retraction", [unknowns, change], [taken], {"cse": True})
 
 
 @lru_cache

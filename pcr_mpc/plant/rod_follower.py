@@ -55,6 +55,7 @@ class RodFollower:
         self.method = method
         self._newton = BufferedFunction(method.newton)
         self._check = BufferedFunction(method.residual)
+        self._retract = BufferedFunction(method.retract)
 
     def cold(self, pose: np.ndarray) -> RodState:
         """Stable shape of least energy."""
@@ -141,14 +142,14 @@ class RodFollower:
                     unknowns = self._polish(unknowns)
                 return self._state(pose, unknowns, newton.outputs[2], scalars[0], iteration)
             if derivatives is not None and residual <= derivatives:
-                trial = unknowns + step
+                trial = self._step(unknowns, step)
                 check.inputs[0][:] = trial
                 check()
                 if check.outputs[0][0] <= self.method.following:
                     return self._state(pose, trial, check.outputs[1], check.outputs[0][0], iteration)
             direction, size = step.copy(), 1.0
             while True:
-                newton.inputs[0][:] = trial = unknowns + size * direction
+                newton.inputs[0][:] = trial = self._step(unknowns, size * direction)
                 newton()
                 # Written so that NaN is a failure.
                 if (
@@ -166,7 +167,7 @@ class RodFollower:
         """One more Newton step, if it gains anything: near a fold each digit of the residual counts."""
         newton = self._newton
         residual = newton.outputs[4][0]
-        newton.inputs[0][:] = better = unknowns + newton.outputs[0]
+        newton.inputs[0][:] = better = self._step(unknowns, newton.outputs[0])
         newton()
         # Written so that NaN is a failure.
         if newton.outputs[4][0] <= residual:
@@ -175,6 +176,12 @@ class RodFollower:
         newton()
         return unknowns
 
+    def _step(self, unknowns: np.ndarray, change: np.ndarray) -> np.ndarray:
+        self._retract.inputs[0][:] = unknowns
+        self._retract.inputs[1][:] = change
+        self._retract()
+        return self._retract.outputs[0].copy()
+
     def _margin(self, state: RodState) -> float:
         """1 - lambda / lambda_c."""
         nodes = self.method.to_nodes(state.unknowns, state.pose[2], _SNAP_NODES)
@@ -182,7 +189,7 @@ class RodFollower:
         return 1.0 - float(load) / critical_load(float(log_tip_angle))
 
     def _predict(self, start: RodState, pose: np.ndarray, derivatives: float | None) -> RodState:
-        predicted = start.unknowns + start.tangent @ (pose - start.pose)
+        predicted = self._step(start.unknowns, start.tangent @ (pose - start.pose))
         state = self.solve(pose, predicted, derivatives, _WARM_ITERATIONS)
         branch = self.method.branch
         if np.abs(state.unknowns[branch] - predicted[branch]).max() > BRANCH_CHANGE:

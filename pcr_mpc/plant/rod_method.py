@@ -47,6 +47,8 @@ class RodMethod:
     name : str
     newton, residual : casadi.Function
         See `multiple_shooting.rod_newton`.
+    retract : casadi.Function
+        (unknowns, change) -> unknowns: how a step is taken.
     tolerance : float
         Residual at which a rod counts as solved: rounding.
     following : float
@@ -64,6 +66,7 @@ class RodMethod:
     name: str
     newton: Any
     residual: Any
+    retract: Any
     tolerance: float
     following: float
     branch: slice
@@ -77,6 +80,7 @@ def shooting_method(shooting: Shooting) -> RodMethod:
     """Multiple shooting, paper sec. 4; the unknowns are the nodes."""
     n = shooting.segments
     newton, residual = multiple_shooting.rod_newton(n, shooting.steps, shooting.scheme)
+    start, change = ca.SX.sym("start", 4 * n), ca.SX.sym("change", 4 * n)
 
     def from_nodes(nodes: np.ndarray) -> np.ndarray:
         same = nodes.shape[1] == n
@@ -86,6 +90,7 @@ def shooting_method(shooting: Shooting) -> RodMethod:
         name="multiple_shooting",
         newton=newton,
         residual=residual,
+        retract=ca.Function("retraction", [start, change], [start + change]),
         # Relative to the load; on taut rods the equations have a condition of 1e8.
         tolerance=1e-10,
         following=1e-10,
@@ -104,9 +109,10 @@ def closed_form_method() -> RodMethod:
         name="closed_form",
         newton=newton,
         residual=residual,
+        retract=elastica.retraction(),
         tolerance=1e-13,
         following=1e-11,
-        branch=slice(0, 2),
+        branch=slice(0, 3),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=elastica.from_nodes,
         to_nodes=elastica.nodes,
@@ -139,10 +145,10 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     for i, rod in enumerate(robot.rods):
         pose = ca.vertcat((p - ca.DM(rod.base)) / rod.length, q[i])
         start = tangents[:, 3 * i : 3 * i + 3]
-        u = predicted = unknowns[:, i] + start @ (pose - poses[:, i])
+        u = predicted = method.retract(unknowns[:, i], start @ (pose - poses[:, i]))
         for _ in range(iterations):
             step, tangent, _, load_tangent, scalars = method.newton(u, pose)
-            u = u + step
+            u = method.retract(u, step)
         residual, loads = method.residual(u, pose)
         for name, value in zip(columns, (u, tangent, pose, loads, load_tangent, scalars), strict=True):
             columns[name].append(value)
