@@ -193,3 +193,17 @@ def from_nodes(states: np.ndarray) -> np.ndarray:
     size = max(float(hand * delta[j]) % (2 * np.pi), 1e-12)
     log_cosh = np.logaddexp(u[j], -u[j]) - np.log(2.0)
     return np.array([np.log(4.0 * np.tan(size / 4.0)) - log_cosh, load, hand])
+
+
+def from_base(states: np.ndarray) -> np.ndarray:
+    """Unknowns near given nodal states by the loads at the base alone: where the tip of a taut rod is all noise."""
+    load = float(np.sqrt(np.hypot(*states[1:3, 0])))
+    hand = 1.0 if states[3, 0] >= 0 else -1.0
+    delta = float(hand * (np.arctan2(states[2, 0], states[1, 0]) - states[0, 0])) % (2 * np.pi)
+    # The pendulum's energy gives the tip angle, unless that is so small that the pendulum is on the separatrix.
+    cos_tip = (states[3, 0] / load) ** 2 / 2 + np.cos(delta)
+    if abs(cos_tip) < 0.99:
+        return np.array([np.log(np.arccos(cos_tip)), load, hand])
+    return np.array(
+        [np.log(4.0 * np.tan(max(delta, 1e-12) / 4.0)) - np.logaddexp(load, -load) + np.log(2.0), load, hand]
+    )

@@ -74,6 +74,16 @@ class RodFollower:
             last = NotConverged(state.residual, state.iterations, state.unknowns, "found only unstable shapes")
         raise last
 
+    def from_nodes(self, pose: np.ndarray, nodes: np.ndarray) -> RodState:
+        """Shape near given nodes, shape (4, N)."""
+        starts = self.method.from_nodes(nodes)
+        for unknowns in starts[:-1]:
+            try:
+                return self.solve(pose, unknowns)
+            except NotConverged:
+                continue
+        return self.solve(pose, starts[-1])
+
     def follow(
         self, start: RodState, pose: np.ndarray, derivatives: float | None = None, *, continuation: bool = True
     ) -> RodState:
@@ -112,7 +122,7 @@ class RodFollower:
             pose = last.pose + distance * fold.step
             distance *= 2.0
             try:
-                state = self.solve(pose, self.method.from_nodes(landing(nodes, pose)))
+                state = self.from_nodes(pose, landing(nodes, pose))
                 elsewhere = np.abs((state.unknowns - last.unknowns)[branch]).max() > BRANCH_CHANGE
                 if elsewhere and state.stable and state.energy < last.energy:
                     return replace(self.follow(state, last.pose + fold.step), rung="snap")

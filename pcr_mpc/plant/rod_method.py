@@ -58,7 +58,7 @@ class RodMethod:
     from_shape : callable
         (shape, clamp angle) -> unknowns: a cold start.
     from_nodes : callable
-        nodes (4, N) -> unknowns: a start from an equilibrium or a guess.
+        nodes (4, N) -> list of unknowns: starts from an equilibrium or a guess, to be tried in this order.
     to_nodes : callable
         (unknowns, clamp angle, wanted number N) -> nodes (4, N); the shooting methods keep their own number.
     """
@@ -71,7 +71,7 @@ class RodMethod:
     following: float
     branch: slice
     from_shape: Callable[[HeldShape, float], np.ndarray]
-    from_nodes: Callable[[np.ndarray], np.ndarray]
+    from_nodes: Callable[[np.ndarray], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
 
 
@@ -82,9 +82,9 @@ def shooting_method(shooting: Shooting) -> RodMethod:
     newton, residual = multiple_shooting.rod_newton(n, shooting.steps, shooting.scheme)
     start, change = ca.SX.sym("start", 4 * n), ca.SX.sym("change", 4 * n)
 
-    def from_nodes(nodes: np.ndarray) -> np.ndarray:
+    def from_nodes(nodes: np.ndarray) -> list[np.ndarray]:
         same = nodes.shape[1] == n
-        return (nodes if same else sample_rod(nodes, n + 1)[2:, :n]).ravel(order="F")
+        return [(nodes if same else sample_rod(nodes, n + 1)[2:, :n]).ravel(order="F")]
 
     return RodMethod(
         name="multiple_shooting",
@@ -114,7 +114,7 @@ def closed_form_method() -> RodMethod:
         following=1e-11,
         branch=slice(0, 3),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
-        from_nodes=elastica.from_nodes,
+        from_nodes=lambda nodes: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
         to_nodes=elastica.nodes,
     )
 

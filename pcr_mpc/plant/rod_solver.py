@@ -90,9 +90,7 @@ class RodSolver:
         rods = []
         for i, pose in enumerate(self._poses(p, q)):
             try:
-                rods.append(
-                    self._rod.cold(pose) if nodes is None else self._rod.solve(pose, self.method.from_nodes(nodes[i]))
-                )
+                rods.append(self._rod.cold(pose) if nodes is None else self._rod.from_nodes(pose, nodes[i]))
             except NotConverged as failure:
                 raise self._error(i, failure, p, q) from None
         self._state, self._spare = RobotState(self.robot, rods), RobotState(self.robot, rods)
