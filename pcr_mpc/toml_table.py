@@ -79,6 +79,13 @@ class Table:
             raise self.fail(key, f"expected an integer >= {minimum}, found {value!r}")
         return value
 
+    def boolean(self, key: str, default: bool = _REQUIRED) -> bool:
+        """Take true or false."""
+        value = self._take(key, default)
+        if not isinstance(value, bool):
+            raise self.fail(key, f"expected true or false, found {value!r}")
+        return value
+
     def vector(self, key: str, size: int | None, default: Any = _REQUIRED) -> Any:
         """Take a list of ``size`` finite numbers (any size if None)."""
         value = self._take(key, default)

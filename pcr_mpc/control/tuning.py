@@ -8,20 +8,34 @@ from pathlib import Path
 import numpy as np
 
 from ..toml_table import read_toml
+from .observer import ObserverTuning
 
 METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 SCHEMES = ("rk4", "rk8")
+LINEARISE = ("here", "along_plan")
 FALLBACKS = ("shifted_plan", "raise")
 
 
 @dataclass(frozen=True)
 class Model:
-    """Discretisation of the model that the controller linearises (see `solve_statics`)."""
+    """What the controller predicts with.
+
+    Attributes
+    ----------
+    method, segments, steps, scheme
+        Discretisation of the rods (see `solve_statics`).
+    linearise : {"here", "along_plan"}
+        Once, at the current state, or at every period of the last plan (real-time iteration).
+    predict_delay : bool
+        Plan from where the commands that are on the way will have brought the robot.
+    """
 
     method: str = "closed_form"
     segments: int = 8
     steps: int = 1
     scheme: str = "rk8"
+    linearise: str = "here"
+    predict_delay: bool = True
 
 
 @dataclass(frozen=True)
@@ -44,7 +58,8 @@ class Tuning:
     fallback : {"shifted_plan", "raise"}
         What an unsolved QP leads to: the next input of the last plan, or an error.
     model : Model
-        What is linearised.
+    observer : ObserverTuning or None
+        None: the measured state is taken as it is, and no force is suspected.
     """
 
     name: str
@@ -57,6 +72,7 @@ class Tuning:
     max_iterations: int
     fallback: str
     model: Model
+    observer: ObserverTuning | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +108,14 @@ def load_tuning(path: str | Path) -> Tuning:
         file.table("weights") as weights,
         file.table("solver", {}) as solver,
         file.table("model", {}) as model,
+        file.table("observer", {}) as observer,
     ):
+        observed = observer.boolean("on", False)
+        noise = ObserverTuning(
+            tip_noise=observer.number("tip_noise", ObserverTuning.tip_noise, above=0.0),
+            force_noise=observer.number("force_noise", ObserverTuning.force_noise, above=0.0),
+            force_walk=observer.number("force_walk", ObserverTuning.force_walk, above=0.0),
+        )
         return Tuning(
             name=file.text("name"),
             horizon=file.integer("horizon"),
@@ -108,5 +131,8 @@ def load_tuning(path: str | Path) -> Tuning:
                 segments=model.integer("segments", Model.segments),
                 steps=model.integer("steps", Model.steps),
                 scheme=model.text("scheme", Model.scheme, choices=SCHEMES),
+                linearise=model.text("linearise", Model.linearise, choices=LINEARISE),
+                predict_delay=model.boolean("predict_delay", Model.predict_delay),
             ),
+            observer=noise if observed else None,
         )

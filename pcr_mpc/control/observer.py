@@ -1,0 +1,91 @@
+"""What the controller knows: tip velocity and an unknown force, from the measured tip and motor angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import control
+import numpy as np
+
+from ..linearisation.linear_model import LinearModel
+
+
+@dataclass(frozen=True)
+class ObserverTuning:
+    """What the observer believes about noise.
+
+    Attributes
+    ----------
+    tip_noise : float
+        Least standard deviation of the measured tip position [m].
+    force_noise : float
+        Of a force that acts for one period and is gone [N].
+    force_walk : float
+        Of the change of the unknown force from one period to the next [N].
+    """
+
+    tip_noise: float = 1e-5
+    force_noise: float = 0.01
+    force_walk: float = 0.005
+
+
+class DisturbanceObserver:
+    """Steady-state Kalman filter for [p, v, d], d a force that walks at random; offset-free because d is one.
+
+    Parameters
+    ----------
+    tuning : ObserverTuning
+    tip_noise : float
+        Standard deviation that the sensor's maker gives for the tip position [m].
+    angle_step : float
+        Resolution of the encoders [rad].
+    model : LinearModel
+        About the pose for which the gain is computed. It depends little on the pose: what matters is
+        sqrt(K/m) dt, which is small.
+
+    Attributes
+    ----------
+    x : ndarray, shape (4 + n,)
+        Estimate of the state.
+    force : ndarray, shape (2,)
+        Estimate of the unknown force [N].
+    """
+
+    def __init__(self, tuning: ObserverTuning, tip_noise: float, angle_step: float, model: LinearModel) -> None:
+        n = model.B.shape[1]
+        self.gain = _gain(tuning, max(tip_noise, tuning.tip_noise), model)
+        self._half_step = angle_step / 2
+        self.x = np.zeros(4 + n)
+        self.force = np.zeros(2)
+
+    def start(self, x: np.ndarray) -> None:
+        """Begin at a known state, without a force."""
+        self.x, self.force = x.copy(), np.zeros(2)
+
+    def correct(self, p: np.ndarray, q: np.ndarray) -> None:
+        """Take in a measurement of the tip [m] and the motor angles [rad].
+
+        An encoder says in which interval the angle is; within it the prediction, which knows the commands, is better.
+        """
+        change = self.gain @ (p - self.x[:2])
+        self.x[:4] += change[:4]
+        self.force += change[4:]
+        self.x[4:] = np.minimum(np.maximum(self.x[4:], q - self._half_step), q + self._half_step)
+
+    def predict(self, model: LinearModel, u: np.ndarray) -> None:
+        """Move on by one period in which the rates u are applied; ``model`` must know the force."""
+        self.x = model(self.x, u)
+
+
+def _gain(tuning: ObserverTuning, tip_noise: float, model: LinearModel) -> np.ndarray:
+    """Gain of the filter, shape (6, 2): what a surprise in the tip position says about [p, v, d]."""
+    a = np.block([[model.A[:4, :4], model.E[:4]], [np.zeros((2, 4)), np.eye(2)]])
+    noise = np.block([[model.E[:4], np.zeros((4, 2))], [np.zeros((2, 2)), np.eye(2)]])
+    covariance = np.diag([tuning.force_noise**2] * 2 + [tuning.force_walk**2] * 2)
+    output = np.eye(2, 6)
+    # In units of the tip's noise: the Riccati equation of 1e-10 m^2 is badly scaled.
+    scale = tip_noise**2
+    driven = noise @ (covariance / scale) @ noise.T
+    _, error, _ = control.dlqe(a, np.eye(6), output, (driven + driven.T) / 2, np.eye(2))
+    # control's gain predicts; this one corrects.
+    return np.asarray(error @ output.T @ np.linalg.inv(output @ error @ output.T + np.eye(2)))

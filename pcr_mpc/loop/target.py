@@ -1,0 +1,45 @@
+"""Where the motors must end up: the reference's angles, moved to carry the force that is observed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import PCRError
+from ..plant.dynamics import Plant
+from ..plant.equilibrium import Equilibrium
+from ..plant.robot import Robot
+
+_LARGEST_STEP = 0.1  # rad
+_ROUGH = 1e-2
+
+
+class MotorTarget:
+    """Shift of the motor angles at which the model's rods carry a given force at a given tip, by Newton's method.
+
+    One iteration a call: the tip and the force change little from one control period to the next, and where they do not
+    change it converges. This is what makes the controller free of offset under a constant load.
+
+    Parameters
+    ----------
+    robot : Robot
+        As the controller believes it to be.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._plant = Plant(robot)
+        self._shift = np.zeros(robot.n_rods)
+
+    def start(self, pose: Equilibrium) -> None:
+        """Begin at a pose on the branch of the reference, without a force."""
+        self._plant.reset(np.concatenate([pose.p, [0.0, 0.0], pose.q]), pose)
+        self._shift = np.zeros(len(pose.q))
+
+    def shift(self, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """Angles to add to q so that F = force at p; the last ones where the rods cannot follow."""
+        try:
+            found, _, g = self._plant.force_and_jacobians(p, q + self._shift, _ROUGH)
+        except PCRError:
+            return self._shift
+        step = np.linalg.lstsq(g, force - found, rcond=1e-6)[0]
+        self._shift = self._shift + step * min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+        return self._shift
