@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import sys
 import traceback
 from pathlib import Path
@@ -65,6 +66,8 @@ def _parser() -> argparse.ArgumentParser:
 
     def command(name: str, run: Any, text: str) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=text, description=text)
+        # Python 3.14's pattern; before, argparse takes -1e-2 for an option.
+        sub._negative_number_matcher = re.compile(r"-\.?\d")
         sub.set_defaults(run=run)
         sub.add_argument("--json", action="store_true", help="print one JSON object on stdout instead of tables")
         sub.add_argument("--traceback", action="store_true", help="show the traceback of a failure")

@@ -6,6 +6,7 @@ The numbers are keyword attributes of the exception (``error.residual``), and su
 from __future__ import annotations
 
 import math
+import numbers
 from typing import Any
 
 import numpy as np
@@ -70,12 +71,71 @@ def checked_vector(name: str, value: Any, size: int) -> np.ndarray:
     Raises
     ------
     ValueError
-        Names the argument and both shapes, or the non-finite entries.
+        Names the argument and both shapes, or the entries that are not finite or not numbers.
     """
-    array = np.ascontiguousarray(value, dtype=float)
-    if array.shape != (size,):
-        raise ValueError(f"{name} has shape {array.shape}, expected ({size},)")
+    array = _float_array(name, value, (size,))
     # Faster than NumPy on the few entries of a state.
     if not all(map(math.isfinite, array.tolist())):
         raise ValueError(f"{name} is not finite: {array}")
     return array
+
+
+def checked_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return ``value`` as a finite float64 array of the given shape; errors as `checked_vector`."""
+    array = _float_array(name, value, shape)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} is not finite")
+    return array
+
+
+def _float_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    # NumPy would take True for 1.0 and "1" for 1.0.
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name} is {value!r}, expected numbers")
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    return np.ascontiguousarray(array, dtype=float)
+
+
+def checked_number(
+    name: str,
+    value: Any,
+    *,
+    above: float = -math.inf,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+) -> float:
+    """Return ``value`` as a finite float within bounds, or say what it is instead.
+
+    Raises
+    ------
+    ValueError
+        Names the argument, its value and the bounds.
+    """
+    problem = number_problem(value, above=above, minimum=minimum, maximum=maximum)
+    if problem:
+        raise ValueError(f"{name}: {problem}")
+    return float(value)
+
+
+def number_problem(
+    value: Any, *, above: float = -math.inf, minimum: float = -math.inf, maximum: float = math.inf
+) -> str | None:
+    """What keeps ``value`` from being a finite number within bounds; None if nothing does."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return f"expected a number, found {value!r}"
+    try:
+        number = float(value)
+    except OverflowError:  # an integer beyond the range of a float
+        number = math.inf
+    if math.isnan(number):
+        return "expected a number, found nan"
+    if math.isfinite(number) and number > above and minimum <= number <= maximum:
+        return None
+    bounds = [f"{sign} {bound:g}" for sign, bound in ((">", above), (">=", minimum), ("<=", maximum))
+              if math.isfinite(bound)]  # fmt: skip
+    return f"is {number:g}, expected a finite number {' and '.join(bounds)}".rstrip()

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from .errors import ModelError
+from .errors import ModelError, number_problem
 
 _REQUIRED: Any = object()
 
@@ -17,7 +17,8 @@ _REQUIRED: Any = object()
 class Table:
     """One TOML table whose keys are taken one by one; what is left over is an error.
 
-    Use as a context manager: leaving it checks that no unknown key remains.
+    Use as a context manager: leaving it checks that no unknown key remains, and a `ModelError` about a value, raised
+    within, is given the name of the file.
     """
 
     def __init__(self, path: Path, name: str, data: dict[str, Any]) -> None:
@@ -29,7 +30,9 @@ class Table:
     def __enter__(self) -> Table:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, ModelError) and "file" not in error.details:
+            raise ModelError(f"{self.path}: {self.name}{error}", file=str(self.path), **error.details) from None
         if kind is None and self._data:
             self._unknown(next(iter(self._data)))
 
@@ -62,14 +65,13 @@ class Table:
         *,
         above: float = -math.inf,
         minimum: float = -math.inf,
+        maximum: float = math.inf,
     ) -> float:
-        """Take a finite number, greater than ``above`` and at least ``minimum``."""
+        """Take a finite number, greater than ``above`` and from ``minimum`` to ``maximum``."""
         value = self._take(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
-            raise self.fail(key, f"expected a number, found {value!r}")
-        if not (value > above and value >= minimum) or (math.isinf(value) and value is not default):
-            bound = f"> {above}" if above > -math.inf else f">= {minimum}"
-            raise self.fail(key, f"is {value}, expected a finite number {bound}")
+        problem = number_problem(value, above=above, minimum=minimum, maximum=maximum)
+        if problem:
+            raise self.fail(key, problem)
         return float(value)
 
     def integer(self, key: str, default: int = _REQUIRED, *, minimum: int = 1) -> int:
@@ -94,7 +96,7 @@ class Table:
         if (
             not isinstance(value, list)
             or (size is not None and len(value) != size)
-            or not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
+            or any(number_problem(v) for v in value)
         ):
             count = "" if size is None else f"{size} "
             raise self.fail(key, f"expected a list of {count}finite numbers, found {value!r}")
@@ -138,6 +140,7 @@ def read_toml(path: str | Path) -> Table:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ModelError(f"{path}: no such file", file=str(path)) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    # ValueError: not UTF-8, not TOML, or an integer of thousands of digits; RecursionError: thousands of brackets.
+    except (OSError, ValueError, RecursionError) as error:
         raise ModelError(f"{path}: {error}", file=str(path)) from error
     return Table(path, "", data)

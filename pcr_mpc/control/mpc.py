@@ -10,11 +10,11 @@ from functools import cached_property
 import control
 import numpy as np
 
-from ..errors import InfeasibleError
+from ..errors import InfeasibleError, checked_vector
 from ..frozen import freeze
 from ..linearisation.linear_model import LinearModel
 from .osqp_solver import QPSolver, Solution
-from .qp import QuadraticProgram, Reference, build_qp, constraint_matrix
+from .qp import QuadraticProgram, Reference, build_qp, constraint_matrix, model_sequence
 from .tuning import Limits, Tuning
 
 
@@ -121,11 +121,15 @@ class LinearMPC:
         Raises
         ------
         InfeasibleError
-            The QP was not solved, and the tuning asks to raise or there is no earlier plan to fall back to.
+            The QP was not solved, and the tuning asks to raise or there is no earlier plan to fall back to; or the
+            model has no terminal weight.
+        ValueError
+            Names an argument that is not finite or of the wrong shape; the controller is as it was before.
         """
         began = time.perf_counter()
-        first = models if isinstance(models, LinearModel) else models[0]
-        n = first.B.shape[1]
+        first = model_sequence(models, self.tuning.horizon)[0]
+        n_states, n = first.B.shape
+        x, u_previous = checked_vector("x", x, n_states), checked_vector("u_previous", u_previous, n)
         if self._terminal_weight is None or self._workspace is None:
             self.prepare(first)
         assert self._terminal_weight is not None

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import osqp
 import scipy.sparse as sp
-from scipy.linalg.blas import dspmv
+from scipy.linalg.blas import ddot, dspmv
 
 from ..errors import InfeasibleError
 
@@ -85,6 +85,7 @@ class QPSolver:
         hessian = sp.csc_matrix((diagonal, rows, starts), shape=(n, n))
         self._osqp = osqp.OSQP()
         self._osqp.setup(hessian, np.zeros(n), self._matrix, -np.ones(m), np.ones(m), **self._settings)
+        self._data: tuple[np.ndarray, ...] | None = None
 
     def warm_start(self, x: np.ndarray) -> None:
         """Start the next solve from x, shape (n,), keeping the last multipliers."""
@@ -106,7 +107,8 @@ class QPSolver:
         ValueError
             Wrong shape or type, or an entry that is not finite; the old data then stay.
         InfeasibleError
-            Some bounds cross; ``limit`` is the row. The old data stay.
+            Some bounds cross; ``limit`` is the row, and the old data stay. Or P is not convex: then OSQP has lost the
+            old data, and needs good ones before it solves again.
         """
         P, q = self._checked("P", P, self._n_hessian), self._checked("q", q, self.n)
         l, u = self._checked("l", l, self.m, bound=True), self._checked("u", u, self.m, bound=True)  # noqa: E741
@@ -119,7 +121,14 @@ class QPSolver:
                 limit=row,
             )
         core = self._osqp._solver
-        self._require(core.update_data_mat(P_x=P, P_i=None, A_x=None, A_i=None), "update_data_mat")
+        if core.update_data_mat(P_x=P, P_i=None, A_x=None, A_i=None):
+            # OSQP keeps the refused P, and would say "solved" of a mixture.
+            self.reset()
+            raise InfeasibleError(
+                "the QP is not convex: P has a negative eigenvalue; check the weights and the model",
+                status="non convex",
+                limit=None,
+            )
         self._require(core.update_data_vec(q=q, l=l, u=u), "update_data_vec")
         self._data = P, q, l, u
 
@@ -128,10 +137,14 @@ class QPSolver:
 
         Raises
         ------
+        ValueError
+            There are no data yet.
         InfeasibleError
             OSQP's status is anything but "solved"; ``status`` says what, ``iterations`` how far it got, ``limit``
             which row stands most in the way if the problem is infeasible.
         """
+        if self._data is None:
+            raise ValueError("there is no QP to solve: call update first")
         core = self._osqp._solver
         core.solve()
         info = core.info
@@ -151,11 +164,12 @@ class QPSolver:
                 limit=limit,
             )
         x, y = np.array(core.solution.x), np.array(core.solution.y)
-        primal, dual = self._residuals(x, y)
+        primal, dual = self._residuals(x, y, *self._data)
         return Solution(x, y, int(info.iter), primal, dual)
 
-    def _residuals(self, x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-        hessian, q, lower, upper = self._data
+    def _residuals(
+        self, x: np.ndarray, y: np.ndarray, hessian: np.ndarray, q: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    ) -> tuple[float, float]:
         ax = self._dense_a @ x
         primal = max(float((lower - ax).max()), float((ax - upper).max()), 0.0)
         # The upper triangle column by column is BLAS's packed form.
@@ -167,8 +181,8 @@ class QPSolver:
         array = np.ascontiguousarray(value, dtype=float)
         if array.shape != (size,):
             raise ValueError(f"{name} has shape {array.shape}, expected ({size},)")
-        # The sum of squares is NaN if any entry is, and at most inf otherwise.
-        squares = float(array @ array)
+        # The sum of squares is NaN if any entry is, and at most inf otherwise (BLAS does not warn of that).
+        squares = float(ddot(array, array))
         if math.isnan(squares) or (not bound and not squares < math.inf and not np.isfinite(array).all()):
             raise ValueError(f"{name} is not finite")
         # OSQP's infinity is 1e30: larger bounds are refused by it.

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..buffered import BufferedFunction
+from ..errors import checked_array, checked_vector
 from ..frozen import read_only
 from ..linearisation.linear_model import LinearModel
 from .tuning import Limits, Tuning
@@ -84,13 +85,16 @@ def build_qp(
         T, for instance the cost-to-go of the LQR.
     """
     single = isinstance(models, LinearModel)
-    sequence: Sequence[LinearModel] = [models] if isinstance(models, LinearModel) else models
+    sequence = model_sequence(models, tuning.horizon)
     n_states, n = sequence[0].B.shape
     if any(model.dt != sequence[0].dt for model in sequence):
         raise ValueError("models have different periods dt")
-    if not single and len(sequence) != tuning.horizon:
-        raise ValueError(f"models has {len(sequence)} entries, expected 1 or the horizon {tuning.horizon}")
-    _check_shapes(x, reference, u_previous, tuning.horizon, n_states, n)
+    x, u_previous = checked_vector("x", x, n_states), checked_vector("u_previous", u_previous, n)
+    wanted = checked_array("reference.states", reference.states, (tuning.horizon, n_states))
+    feed_forward = checked_array("reference.inputs", reference.inputs, (tuning.horizon, n))
+    terminal_weight = checked_array("terminal_weight", terminal_weight, (n_states, n_states))
+    if len(limits.angle_lower) != n:
+        raise ValueError(f"limits are for {len(limits.angle_lower)} motors, the model has {n}")
     function = _condensing(
         tuning.horizon, n, single, tuning.velocity_weight > 0, tuning.angle_weight > 0, threading.get_ident()
     )
@@ -100,8 +104,8 @@ def build_qp(
         b[:, k * n : (k + 1) * n] = model.B
         c[k * n_states : (k + 1) * n_states] = model.c
     start[:] = x
-    states.reshape((n_states, -1), order="F")[:] = reference.states.T
-    inputs.reshape((n, -1), order="F")[:] = reference.inputs.T
+    states.reshape((n_states, -1), order="F")[:] = wanted.T
+    inputs.reshape((n, -1), order="F")[:] = feed_forward.T
     previous[:] = u_previous
     weights[:] = tuning.position_weight, tuning.velocity_weight, tuning.angle_weight, tuning.input_weight
     terminal[:] = terminal_weight
@@ -129,17 +133,17 @@ def constraint_matrix(horizon: int, n: int) -> sp.csc_matrix:
     return matrix
 
 
-def _check_shapes(
-    x: np.ndarray, reference: Reference, u_previous: np.ndarray, horizon: int, n_states: int, n: int
-) -> None:
-    for name, array, shape in (
-        ("x", x, (n_states,)),
-        ("u_previous", u_previous, (n,)),
-        ("reference.states", reference.states, (horizon, n_states)),
-        ("reference.inputs", reference.inputs, (horizon, n)),
-    ):
-        if array.shape != shape:
-            raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+def model_sequence(models: LinearModel | Sequence[LinearModel], horizon: int) -> Sequence[LinearModel]:
+    """One model as a list, or the models of all periods; ValueError if their number or shapes are wrong."""
+    sequence: Sequence[LinearModel] = [models] if isinstance(models, LinearModel) else models
+    if not isinstance(models, LinearModel) and len(sequence) != horizon:
+        raise ValueError(f"models has {len(sequence)} entries, expected 1 or the horizon {horizon}")
+    n = sequence[0].B.shape[-1]
+    for model in sequence:
+        shapes = model.A.shape, model.B.shape, model.c.shape
+        if shapes != ((4 + n, 4 + n), (4 + n, n), (4 + n,)):
+            raise ValueError(f"A, B, c of a model have shapes {shapes}, expected those of {n} motors")
+    return sequence
 
 
 @lru_cache(maxsize=32)

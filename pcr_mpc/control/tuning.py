@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import checked_number
 from ..toml_table import read_toml
 from .observer import ObserverTuning
 
@@ -74,6 +75,17 @@ class Tuning:
     model: Model
     observer: ObserverTuning | None = None
 
+    def __post_init__(self) -> None:
+        for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
+            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+                raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+        for name in ("position_weight", "input_weight", "tolerance"):
+            checked_number(name, getattr(self, name), above=0.0)
+        for name in ("velocity_weight", "angle_weight"):
+            checked_number(name, getattr(self, name), minimum=0.0)
+        if self.fallback not in FALLBACKS:
+            raise ValueError(f"fallback is {self.fallback!r}, expected one of {', '.join(FALLBACKS)}")
+
 
 @dataclass(frozen=True, eq=False)
 class Limits:
@@ -93,6 +105,14 @@ class Limits:
     rate_change: float
     angle_lower: np.ndarray
     angle_upper: np.ndarray
+
+    def __post_init__(self) -> None:
+        # Infinite limits are none; written so that NaN is refused.
+        if not (self.rate > 0 and self.rate_change > 0):
+            raise ValueError(f"rate = {self.rate} and rate_change = {self.rate_change} must be positive")
+        lower, upper = np.asarray(self.angle_lower), np.asarray(self.angle_upper)
+        if lower.ndim != 1 or lower.shape != upper.shape or not (lower <= upper).all():
+            raise ValueError(f"angle_lower = {lower} and angle_upper = {upper} must be vectors, lower <= upper")
 
 
 def load_tuning(path: str | Path) -> Tuning:

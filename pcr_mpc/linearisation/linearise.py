@@ -10,11 +10,11 @@ import casadi as ca
 import numpy as np
 
 from ..buffered import BufferedFunction
-from ..errors import checked_vector
+from ..errors import checked_number, checked_vector
 from ..plant.dynamics import Plant
 from .linear_model import LinearModel
 
-# Taylor order and squarings of the matrix exponential: better than 1e-9 up to K dt^2/m = 1000.
+# Taylor order and squarings of the matrix exponential: better than 1e-9 up to K dt^2/m and (c dt/m)^2 of 1000.
 _TAYLOR_ORDER, _SQUARINGS = 8, 6
 _STIFFEST = 1e3
 # Residual of the statics at which K and G may be taken; their error is of this size.
@@ -46,28 +46,31 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     UnreachableError, ConvergenceError, UnstableError
         As `Plant.step`.
     ValueError
-        dt is not positive, or so long that K dt^2/m exceeds 1000.
+        dt is not a positive number, or so long that K dt^2/m or (c dt/m)^2 exceeds 1000; or the model overflows.
     """
     x = checked_vector("x", x, plant.n_states)
     checked_vector("u", u, plant.robot.n_rods)
     f_ext = checked_vector("f_ext", f_ext, 2)
-    if not 0.0 < dt < np.inf:
-        raise ValueError(f"dt is {dt} s, expected a positive number")
+    dt = checked_number("dt", dt, minimum=1e-12)
     force, k, g = plant.force_and_jacobians(x[:2], x[4:], _DERIVATIVE_ACCURACY)
-    stiffness = float(np.abs(k).max()) * dt * dt / plant.robot.tip_mass
-    if stiffness > _STIFFEST:
+    mass, drag = plant.robot.tip_mass, plant.robot.drag
+    stiffness, damping = float(np.abs(k).max()) * dt * dt / mass, drag * dt / mass
+    if not (stiffness <= _STIFFEST and damping * damping <= _STIFFEST):
         raise ValueError(
-            f"dt = {dt} s is too long for the stiffness at p = {x[:2]} m: K dt^2/m is {stiffness:.3g}, at most "
-            f"{_STIFFEST:g}; shorten the period or keep away from taut rods"
+            f"dt = {dt} s is too long for the stiffness at p = {x[:2]} m or for the drag: K dt^2/m is {stiffness:.3g} "
+            f"and (c dt/m)^2 is {damping * damping:.3g}, at most {_STIFFEST:g}; shorten the period or keep away from "
+            "taut rods"
         )
     function = _discretisation(plant.robot.n_rods, threading.get_ident())
     function.inputs[0][:] = k
     function.inputs[1][:] = g
     function.inputs[2][:] = force - f_ext
     function.inputs[3][:] = x
-    function.inputs[4][:] = plant.robot.tip_mass, plant.robot.drag, dt
+    function.inputs[4][:] = mass, drag, dt
     function()
     a, b, c, e = (output.copy() for output in function.outputs)
+    if not np.isfinite(c).all():
+        raise ValueError(f"the linear model at x = {x} with external force {f_ext} N is not finite")
     return LinearModel(a, b, c, e, dt)
 
 

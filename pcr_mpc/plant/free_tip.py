@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 import threading
 from functools import lru_cache
 from typing import Any
@@ -17,6 +17,7 @@ from .rod_method import closed_form_method
 from .rod_solver import RodSolver
 
 _MAX_ITERATIONS = 100
+_MAX_TRIALS = 30  # motor angles tried for one balance; of 1600 that were found, the slowest took 21
 _FORCE_TOLERANCE = 1e-9  # of the robot's force scale, sum EI/L^2
 _RESOLUTION = 1e-12  # of the tip position, in rod lengths
 _ANGLE_STEP = 0.25  # largest motor step of a continuation [rad]
@@ -26,6 +27,7 @@ _TIP_STEP = 0.05  # largest tip step of a continuation, in rod lengths
 _OFFSETS = np.linspace(-2.6, 2.6, 40)  # clamp angle minus chord angle, of a cold inverse start [rad]
 _CANDIDATES = 24
 _COMBINATIONS = 100_000
+_NARROW = 3  # angles between the stops that a cold inverse start needs at least
 
 
 def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equilibrium | None = None) -> Equilibrium:
@@ -53,9 +55,10 @@ def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equili
     ConvergenceError
         No stable pose was found.
     """
-    q, force = checked_vector("q", q, robot.n_rods), checked_vector("force", force, 2)
+    q, force = robot.checked_angles("q", q), checked_vector("force", force, 2)
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
+        _require_equilibrium(guess)
         return _follow(solver, guess, q, force)
     found: list[Equilibrium] = []
     last: PCRError | None = None
@@ -110,11 +113,12 @@ def inverse_statics(
     if guess is not None:
         if mode is not None:
             raise ValueError("give either guess, whose branch is followed, or mode, for a search")
+        _require_equilibrium(guess)
         solver.start(guess.p, guess.q, guess.nodes)
         eq = solver.equilibrium(p, _reach(solver, guess, p, force))
         _require_usable(eq)
         return eq
-    if mode is not None and (len(mode) != robot.n_rods or set(mode) - set("LR")):
+    if mode is not None and (not isinstance(mode, str) or len(mode) != robot.n_rods or set(mode) - set("LR")):
         raise ValueError(f"mode is {mode!r}, expected {robot.n_rods} letters L or R")
     found: list[Equilibrium] = []
     for q in _angle_starts(robot, p, force, mode):
@@ -149,7 +153,7 @@ def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -
         values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
         # No better than the tip position is resolved, which counts where rods are nearly straight.
         tolerance = _FORCE_TOLERANCE * _force_scale(robot) + _RESOLUTION * float(robot.lengths.max() * values[-1])
-        if np.linalg.norm(residual) <= tolerance:
+        if math.hypot(*residual) <= tolerance:
             if values[0] <= 0 or solver.unstable_rods():
                 raise UnstableError(
                     f"the pose p = {p} m, q = {q} rad is in balance but not stable: smallest stiffness "
@@ -163,31 +167,31 @@ def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -
             return p
         # Newton where the energy is convex, downhill where it is not.
         step = -vectors @ ((vectors.T @ residual) / np.maximum(np.abs(values), 1e-3 * np.abs(values).max()))
-        step *= min(1.0, radius / float(np.linalg.norm(step)))
+        step *= radius / max(math.hypot(*step), radius)
         while True:
             try:
                 robot.require_reachable(p + step)
                 solver.move(p + step, q, continuation=False)
                 trial = solver.energy() - force @ (p + step)
                 # Near the minimum the energy is flat to rounding: there the force must shrink instead.
-                if trial < energy or np.linalg.norm(solver.force() - force) < 0.5 * np.linalg.norm(residual):
+                if trial < energy or math.hypot(*(solver.force() - force)) < 0.5 * math.hypot(*residual):
                     break
             except PCRError:
                 pass
             step = step / 2
-            if np.linalg.norm(step) < 1e-7 * robot.lengths.min():
+            if not math.hypot(*step) >= 1e-7 * robot.lengths.min():
                 raise ConvergenceError(
                     f"the tip cannot settle near p = {p} m for q = {q} rad: force residual "
-                    f"{np.linalg.norm(residual):.3g} N after {iteration} iterations; pass a guess",
-                    residual=float(np.linalg.norm(residual)),
+                    f"{math.hypot(*residual):.3g} N after {iteration} iterations; pass a guess",
+                    residual=math.hypot(*residual),
                     iterations=iteration,
                     last=p,
                 )
         p, energy = p + step, trial
     raise ConvergenceError(
         f"the tip did not settle in {_MAX_ITERATIONS} iterations, last at p = {p} m, force residual "
-        f"{np.linalg.norm(residual):.3g} N; pass a guess",
-        residual=float(np.linalg.norm(residual)),
+        f"{math.hypot(*residual):.3g} N; pass a guess",
+        residual=math.hypot(*residual),
         iterations=_MAX_ITERATIONS,
         last=p,
     )
@@ -230,6 +234,11 @@ def _follow(solver: RodSolver, guess: Equilibrium, q: np.ndarray, force: np.ndar
         else:
             eq, done, substep = solver.equilibrium(p, at_q), target, min(2 * substep, largest)
     return eq
+
+
+def _require_equilibrium(guess: Any) -> None:
+    if not isinstance(guess, Equilibrium):
+        raise TypeError(f"guess is a {type(guess).__name__}, expected an Equilibrium")
 
 
 def _require_usable(eq: Equilibrium) -> None:
@@ -285,34 +294,27 @@ def _turn(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) ->
     """Turn the motors by Newton's method (least motion if redundant) until the rods carry ``force`` at p."""
     tolerance = _FORCE_TOLERANCE * _force_scale(solver.robot)
     solver.move(p, q)
-    residual = force - solver.force()
-    for iteration in range(_MAX_ITERATIONS):
-        if np.linalg.norm(residual) <= tolerance:
-            return q
-        _, sensitivity = solver.jacobians()
-        step = np.linalg.lstsq(sensitivity, residual, rcond=1e-10)[0]
-        step *= min(1.0, _ANGLE_STEP / float(np.abs(step).max()))
+    residual, trials = force - solver.force(), 0
+    while math.hypot(*residual) > tolerance:
+        step = np.linalg.lstsq(solver.jacobians()[1], residual, rcond=1e-10)[0]
+        step *= _ANGLE_STEP / max(float(np.abs(step).max()), _ANGLE_STEP)
         while True:
-            solver.move(p, q + step)
-            trial = force - solver.force()
-            if np.linalg.norm(trial) < np.linalg.norm(residual):
-                break
-            step = step / 2
-            if np.abs(step).max() < 1e-10:
+            if trials == _MAX_TRIALS:
                 raise ConvergenceError(
-                    f"motors cannot balance p = {p} m: force residual {np.linalg.norm(residual):.3g} N at q = {q} rad",
-                    residual=float(np.linalg.norm(residual)),
-                    iterations=iteration,
+                    f"motors cannot balance p = {p} m: force residual {math.hypot(*residual):.3g} N at q = {q} rad "
+                    f"after {trials} trials",
+                    residual=math.hypot(*residual),
+                    iterations=trials,
                     last=q,
                 )
+            solver.move(p, q + step)
+            trials += 1
+            trial = force - solver.force()
+            if math.hypot(*trial) < math.hypot(*residual):
+                break
+            step = step / 2
         q, residual = q + step, trial
-    raise ConvergenceError(
-        f"motors did not balance p = {p} m in {_MAX_ITERATIONS} iterations: force residual "
-        f"{np.linalg.norm(residual):.3g} N at q = {q} rad",
-        residual=float(np.linalg.norm(residual)),
-        iterations=_MAX_ITERATIONS,
-        last=q,
-    )
+    return q
 
 
 def _tip_starts(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
@@ -334,33 +336,34 @@ def _tip_starts(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
 
 def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | None) -> list[np.ndarray]:
     """Motor angles within limits whose coarse shapes nearly carry ``force``, best first."""
-    per_rod = []
+    scale = _force_scale(robot)
     # The coarser, the more rods there are to combine.
-    offsets = _OFFSETS[:: max(1, int(np.ceil(len(_OFFSETS) / _COMBINATIONS ** (1 / robot.n_rods))))]
+    stride = math.ceil(len(_OFFSETS) / max(1, int(_COMBINATIONS ** (1 / robot.n_rods))))
+    offsets = _OFFSETS[stride // 2 :: stride]
+    per_rod: list[np.ndarray] = []
+    scores = np.zeros((1, 3))  # mismatch of the force (2) and energy of every combination so far
+    scores[0, :2] = -force / scale
     for i, rod in enumerate(robot.rods):
         dx, dy = (p - rod.base) / rod.length
-        chord = np.arctan2(dy, dx)
         lower, upper = rod.angle_limits
-        unit = rod.bending_stiffness / rod.length**2
+        angles = lower + (np.arctan2(dy, dx) + offsets - lower) % (2 * np.pi)
+        angles = angles[angles <= upper]
+        if len(angles) < _NARROW:
+            angles = np.linspace(lower, upper, _NARROW)
+        unit = rod.bending_stiffness / rod.length**2 / scale
         rows = []
-        for angle in chord + offsets:
-            angle = lower + (angle - lower) % (2 * np.pi)
-            if angle > upper:
-                continue
+        for angle in angles:
             cos, sin = np.cos(angle), np.sin(angle)
             shape = held_shapes(cos * dx + sin * dy, cos * dy - sin * dx)[0]
             if mode is None or ("L" if shape.hand < 0 else "R") == mode[i]:
                 n_x, n_y = shape.nodes(1, angle)[1:3, 0] * unit
                 rows.append((angle, n_x, n_y, shape.energy))
-        per_rod.append(rows)
-    scored = []
-    scale = _force_scale(robot)
-    for combination in itertools.product(*per_rod):
-        angles, n_x, n_y, energy = zip(*combination, strict=True)
-        mismatch = np.hypot(sum(n_x) - force[0], sum(n_y) - force[1]) / scale
-        scored.append((mismatch + 0.02 * sum(energy), angles))
-    scored.sort()
-    return [np.array(angles) for _, angles in scored[:_CANDIDATES]]
+        table = np.array(rows).reshape(-1, 4)
+        per_rod.append(table[:, 0])
+        scores = (scores[:, None] + table[:, 1:]).reshape(-1, 3)
+    best = np.argsort(np.hypot(*scores.T[:2]) + 0.02 * scores[:, 2], kind="stable")[:_CANDIDATES]
+    chosen = np.unravel_index(best, [len(angles) for angles in per_rod])
+    return list(np.stack([angles[at] for angles, at in zip(per_rod, chosen, strict=True)], axis=1))
 
 
 def _force_scale(robot: Robot) -> float:

@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, UnreachableError
+from ..errors import ModelError, UnreachableError, checked_number, checked_vector
 from ..frozen import read_only
 from ..toml_table import read_toml
+
+# SI units; wide enough for DNA and for bridges, and no product of a few such numbers overflows.
+_POSITIVE = {"minimum": 1e-30, "maximum": 1e30}
+_NOT_NEGATIVE = {"minimum": 0.0, "maximum": 1e30}
+_ROD_NUMBERS = {"length": _POSITIVE, "bending_stiffness": _POSITIVE, "line_density": _NOT_NEGATIVE}
+_ROBOT_NUMBERS = {
+    "tip_mass": _POSITIVE,
+    "drag": _NOT_NEGATIVE,
+    "rate_limit": _POSITIVE,
+    "acceleration_limit": _POSITIVE,
+    "torque_limit": _POSITIVE,
+}
+# Fraction of the length by which a rod must fall short of straight: closer, the rounding of the tip position alone
+# decides the force.
+_LEAST_SLACK = 1e-9
+# Beyond it the rounding of an angle, 1e-10 rad, shows in the shape of a rod [rad].
+_LARGEST_ANGLE = 1e6
 
 
 @dataclass(frozen=True)
@@ -36,6 +55,15 @@ class Rod:
     bending_stiffness: float
     line_density: float
     angle_limits: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        _check_numbers(self, _ROD_NUMBERS)
+        for name in ("base", "angle_limits"):
+            pair = checked_vector(name, getattr(self, name), 2)
+            object.__setattr__(self, name, tuple(pair.tolist()))
+        lower, upper = self.angle_limits
+        if lower >= upper:
+            raise ModelError(f"angle_limits: lower {lower} is not below upper {upper}", key="angle_limits")
 
 
 @dataclass(frozen=True)
@@ -69,6 +97,11 @@ class Robot:
     torque_limit: float
 
     def __post_init__(self) -> None:
+        _check_numbers(self, _ROBOT_NUMBERS)
+        object.__setattr__(self, "rods", tuple(self.rods))
+        for rod in self.rods:
+            if not isinstance(rod, Rod):
+                raise TypeError(f"rods holds {rod!r}, expected a Rod")
         bases = [rod.base for rod in self.rods]
         if len(self.rods) < 2 or len(set(bases)) < len(bases):
             raise ModelError(f"{self.name}: needs two or more rods at different bases, found {bases}", bases=bases)
@@ -98,18 +131,42 @@ class Robot:
         """Least and greatest motor angles, shape (n, 2) [rad]."""
         return read_only(np.array([rod.angle_limits for rod in self.rods]))
 
+    def checked_angles(self, name: str, value: Any) -> np.ndarray:
+        """Return motor angles as a float64 vector, shape (n,) [rad], or say what is wrong with them."""
+        q = checked_vector(name, value, self.n_rods)
+        if np.abs(q).max() > _LARGEST_ANGLE:
+            raise ValueError(f"{name} is {q} rad, expected at most {_LARGEST_ANGLE:g} rad; take off the whole turns")
+        return q
+
     def require_reachable(self, p: np.ndarray) -> None:
         """Raise `UnreachableError` if some rod cannot reach ``p``, shape (2,) [m]."""
+        x, y = map(float, p)
         for i, rod in enumerate(self.rods):
-            distance = float(np.hypot(p[0] - rod.base[0], p[1] - rod.base[1]))
-            if distance >= rod.length:
+            distance = math.hypot(x - rod.base[0], y - rod.base[1])
+            excess = distance - rod.length
+            margin = _LEAST_SLACK * rod.length
+            # Written so that NaN is out of reach.
+            if not excess <= -margin:
+                advice = (
+                    "fully stretched it has no definite force; move the tip closer to its base"
+                    if abs(excess) <= margin
+                    else f"move the tip at least {excess:.3g} m closer"
+                )
                 raise UnreachableError(
-                    f"tip ({p[0]:.6g}, {p[1]:.6g}) m is {distance:.6g} m from the base of rod {i}, whose length "
-                    f"is {rod.length:.6g} m; move the tip at least {distance - rod.length:.3g} m closer",
+                    f"tip ({x:.6g}, {y:.6g}) m is {distance:.6g} m from the base of rod {i}, whose length "
+                    f"is {rod.length:.6g} m; {advice}",
                     rod=i,
                     distance=distance,
                     length=rod.length,
                 )
+
+
+def _check_numbers(instance: Any, bounds: dict[str, dict[str, float]]) -> None:
+    for name, bound in bounds.items():
+        try:
+            object.__setattr__(instance, name, checked_number(name, getattr(instance, name), **bound))
+        except ValueError as error:
+            raise ModelError(str(error), key=name) from None
 
 
 def load_robot(path: str | Path) -> Robot:
@@ -128,22 +185,17 @@ def load_robot(path: str | Path) -> Robot:
                 rods.append(
                     Rod(
                         base=table.vector("base", 2),
-                        length=table.number("length", above=0.0),
-                        bending_stiffness=table.number("bending_stiffness", above=0.0),
-                        line_density=table.number("line_density", minimum=0.0),
+                        length=table.number("length"),
+                        bending_stiffness=table.number("bending_stiffness"),
+                        line_density=table.number("line_density"),
                         angle_limits=table.vector("angle_limits", 2),
                     )
                 )
-                lower, upper = rods[-1].angle_limits
-                if lower >= upper:
-                    raise table.fail("angle_limits", f"lower {lower} is not below upper {upper}")
         with file.table("tip") as tip, file.table("motors") as motors:
-            return Robot(
-                name=name,
-                rods=tuple(rods),
-                tip_mass=tip.number("mass", above=0.0),
-                drag=tip.number("drag", minimum=0.0),
-                rate_limit=motors.number("rate_limit", above=0.0),
-                acceleration_limit=motors.number("acceleration_limit", above=0.0),
-                torque_limit=motors.number("torque_limit", above=0.0),
-            )
+            numbers = {
+                "tip_mass": tip.number("mass", **_ROBOT_NUMBERS["tip_mass"]),
+                "drag": tip.number("drag", **_ROBOT_NUMBERS["drag"]),
+                **{key: motors.number(key, **_ROBOT_NUMBERS[key])
+                   for key in ("rate_limit", "acceleration_limit", "torque_limit")},
+            }  # fmt: skip
+        return Robot(name=name, rods=tuple(rods), **numbers)

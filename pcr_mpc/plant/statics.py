@@ -19,6 +19,8 @@ from .single_shooting import SingleShooting
 # Steps of order 8 per segment, tried in turn until the drift is small enough.
 _REFINEMENT = (1, 4, 12)
 _WANTED_DRIFT = 1e-6
+# Integration steps along a rod for which a graph may be built: half a minute and 1 GB.
+_MOST_STEPS = 1024
 METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 
 
@@ -75,7 +77,7 @@ def solve_statics(
     .. [1] M. Rekkal, G. Ganesh, J. Cavalcanti Santos, "Towards Computationally Efficient Dynamic
        Model of a Planar Parallel Continuum Robot".
     """
-    p, q = checked_vector("p", p, 2), checked_vector("q", q, robot.n_rods)
+    p, q = checked_vector("p", p, 2), robot.checked_angles("q", q)
     robot.require_reachable(p)
     shooting = checked_shooting(segments, 1 if steps is None else steps, scheme)
     if steps is None and method != "closed_form":
@@ -100,6 +102,8 @@ def _refined(
     """Solve with finer and finer integration until the drift says that the rods are resolved."""
     failure: ConvergenceError | None = None
     for steps in _REFINEMENT:
+        if segments * steps > _MOST_STEPS:
+            break
         try:
             eq = solve_statics(robot, p, q, method=method, segments=segments, steps=steps, guess=guess)
         except ConvergenceError as error:
@@ -121,12 +125,11 @@ def _refined(
 
 def checked_shooting(segments: int, steps: int, scheme: str) -> Shooting:
     """Return the discretisation if it makes sense, or raise ValueError."""
-    if (
-        not (isinstance(segments, int | np.integer) and isinstance(steps, int | np.integer))
-        or segments < 1
-        or steps < 1
-    ):
-        raise ValueError(f"segments = {segments} and steps = {steps} must be whole numbers of at least 1")
+    for name, count in (("segments", segments), ("steps", steps)):
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+    if segments * steps > _MOST_STEPS:
+        raise ValueError(f"segments = {segments} times steps = {steps} is more than {_MOST_STEPS}")
     if scheme not in SCHEMES:
         raise ValueError(f"scheme is {scheme!r}, expected one of {', '.join(SCHEMES)}")
     return Shooting(int(segments), int(steps), scheme)
