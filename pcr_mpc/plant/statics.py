@@ -18,7 +18,10 @@ from .single_shooting import SingleShooting
 
 # Steps of order 8 per segment, tried in turn until the drift is small enough.
 _REFINEMENT = (1, 4, 12)
-_WANTED_DRIFT = 1e-6
+# Single shooting carries the errors of a rod from its base to its tip, where they have grown like exp(lambda).
+_WANTED_DRIFT = {"multiple_shooting": 1e-6, "single_shooting": 1e-9}
+# Below this slack, as a fraction of the length, less drift is wanted: a taut rod's force goes with 1/slack.
+_TAUT = 0.05
 # Integration steps along a rod for which a graph may be built: half a minute and 1 GB.
 _MOST_STEPS = 1024
 METHODS = ("closed_form", "multiple_shooting", "single_shooting")
@@ -80,7 +83,7 @@ def solve_statics(
     p, q = checked_vector("p", p, 2), robot.checked_angles("q", q)
     robot.require_reachable(p)
     shooting = checked_shooting(segments, 1 if steps is None else steps, scheme)
-    if steps is None and method != "closed_form":
+    if steps is None and method in _WANTED_DRIFT:
         return _refined(robot, p, q, method, segments, guess)
     solver = _solver(robot, method, shooting, threading.get_ident())
     if isinstance(guess, Equilibrium):
@@ -101,6 +104,8 @@ def _refined(
 ) -> Equilibrium:
     """Solve with finer and finer integration until the drift says that the rods are resolved."""
     failure: ConvergenceError | None = None
+    slack = 1.0 - float((np.hypot(*(p - robot.bases).T) / robot.lengths).max())
+    wanted = _WANTED_DRIFT[method] * min(1.0, slack / _TAUT)
     for steps in _REFINEMENT:
         if segments * steps > _MOST_STEPS:
             break
@@ -109,11 +114,11 @@ def _refined(
         except ConvergenceError as error:
             failure = error
             continue
-        if eq.drift <= _WANTED_DRIFT:
+        if eq.drift <= wanted:
             return eq
         failure = ConvergenceError(
             f"rods at p = {p} m, q = {q} rad are not resolved by {segments} segments of {steps} steps: the "
-            f"invariant m^2/2 + n.t drifts by {eq.drift:.1e} along a rod (wanted {_WANTED_DRIFT:.0e}); "
+            f"invariant m^2/2 + n.t drifts by {eq.drift:.1e} along a rod (wanted {wanted:.0e}); "
             "they are taut, use more segments",
             residual=eq.residual_norm,
             iterations=eq.iterations,
