@@ -114,13 +114,6 @@ def test_pick_and_place_arrives():
     assert run.summary()["limit_violations"] == 0
 
 
-def test_an_unknown_load_leaves_an_offset():
-    """Without an estimate of the load the tip gives way: the offset is known, not hidden."""
-    scene = load_scene(SCENES / "hold_with_load.toml")
-    run = simulate(scene, scene.make_plant(), make_controller(scene))
-    assert 2.0 < run.summary()["final_error_mm"] < 12.0
-
-
 def test_a_failing_run_keeps_what_it_had(lemniscate, tmp_path):
     scene = replace(lemniscate, duration=0.5)
 
