@@ -1,0 +1,538 @@
+"""Where can the default robot hold its tip, how stiffly, and what ends its workspace?
+
+The motors hold the tip in balance (F = 0). From one pose of a working mode, every tip of a triangular lattice is
+reached by continuation from its neighbours (predictor and Newton's method on the motor angles; through arc length
+where the motors turn fast), and a path of the tip ends where the branch does:
+
+  type 2     an eigenvalue of K passes zero: the tip would snap
+  type 1     det G passes zero: the motors lose a direction of force, two inverse solutions merge
+  rod limit  a rod alone, tip held, would buckle (lambda = lambda_c)
+  reach      a rod is stretched to 0.995 of its length
+  overlap    the tip was reached another way with other motor angles
+  lost       none of these was seen, but Newton's method went no further
+
+The stops of the motors do not end the search; they are drawn over the result. Colour is the smallest eigenvalue of K:
+the force per metre that moves the tip in its softest direction. Motor angles a full turn apart count as one. Poses
+beyond a type 1 curve (the other inverse solution, of the same letters) are not searched.
+
+Writes one picture a mode (tip space, motor space), a CSV with a row for every tip and mode, failures included, and one
+with the points found on the edges, each within 5e-4 rad of arc (5e-5 m of tip motion) of the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as MarkerPath
+from tqdm import tqdm
+
+from pcr_mpc import Equilibrium, PCRError, Robot, assess_stability, inverse_statics, load_robot
+from pcr_mpc.plant.rod_method import closed_form_method
+from pcr_mpc.plant.rod_solver import RodSolver
+from pcr_mpc.report.style import GREY, ORANGE, PURPLE, RED, SKY, plt
+
+Site = tuple[int, int]
+MODES = ("LR", "RL", "LL")
+POSE_COLUMNS = ("mode", "x", "y", "q0", "q1", "stable", "within_stops", "k_soft", "k_stiff", "motor_authority", "det_g",
+                "rod_margin_0", "rod_margin_1", "failure")  # fmt: skip
+EDGE_COLUMNS = ("mode", "reason", "x", "y", "q0", "q1")
+SEED_TIP = (0.0, 0.15)  # m; held in every mode within the stops
+NEIGHBOURS: tuple[Site, ...] = ((1, 0), (0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1))  # counter-clockwise
+REACH = 0.995  # of a rod's length, to which the tip may go
+BALANCED = 1e-9  # |F| over sum EI/L^2
+METRES_PER_RADIAN = 0.1  # in which tip and motor steps are compared
+FIRST_STEP, LONGEST_STEP, SHORTEST_STEP = 0.1, 0.3, 5e-4  # rad
+MOST_STEPS = 300
+SAME = 1e-4  # rad
+COLOURS = {"type 2": RED, "type 1": PURPLE, "rod limit": ORANGE, "reach": GREY, "overlap": SKY, "lost": "black"}
+LABELS = {
+    "type 2": "type 2: the tip snaps",
+    "type 1": "type 1: motors lose a direction",
+    "rod limit": "limit of a rod",
+    "reach": f"rod stretched to {REACH} L",
+    "overlap": "overlap",
+    "lost": "lost",
+}
+SOFTEST, STIFFEST = 1.0, 200.0  # N/m, ends of the colour scale
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """Where a straight path of the tip ended.
+
+    Attributes
+    ----------
+    pose : Equilibrium
+        The last one that was stable.
+    reason : str
+        A key of `LABELS`.
+    """
+
+    pose: Equilibrium
+    reason: str
+
+
+@dataclass(eq=False)
+class Sheet:
+    """The poses of one working mode, connected by stable motion.
+
+    Attributes
+    ----------
+    robot : Robot
+    spacing : float
+        Of the lattice [m].
+    tips : dict
+        Site of the lattice -> tip position [m], for every tip within reach.
+    poses : dict
+        Site -> its pose, where there is one.
+    ends : dict
+        (site, neighbouring site) -> where the path between them ended.
+    """
+
+    robot: Robot
+    spacing: float
+    tips: dict[Site, np.ndarray]
+    poses: dict[Site, Equilibrium] = field(default_factory=dict)
+    ends: dict[tuple[Site, Site], End] = field(default_factory=dict)
+
+    def position(self, site: Site) -> np.ndarray:
+        """Tip position of a site, within reach or not [m]."""
+        return self.spacing * np.array([site[0] + (site[1] + 1) / 2, np.sqrt(0.75) * site[1]])
+
+    def linked(self, a: Site, b: Site) -> bool:
+        """Whether a stable motion along their edge connects the poses of two neighbours."""
+        return a in self.poses and b in self.poses and (a, b) not in self.ends and (b, a) not in self.ends
+
+
+def make_sheet(robot: Robot, spacing: float) -> Sheet:
+    """Lattice without poses, mirror-symmetric about both axes."""
+    sheet = Sheet(robot, spacing, {})
+    most = int(2 * robot.lengths.max() / spacing) + 1
+    for i, j in itertools.product(range(-most, most + 1), repeat=2):
+        p = sheet.position((i, j))
+        if stretch(robot, p) < 1:
+            sheet.tips[i, j] = p
+    return sheet
+
+
+def stretch(robot: Robot, p: np.ndarray) -> float:
+    """Largest distance from the tip to a base over the length of the rod."""
+    return float((np.linalg.norm(p - robot.bases, axis=1) / robot.lengths).max())
+
+
+def turn_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Motor angles from ``a`` to ``b`` up to full turns, each within pi of zero [rad]."""
+    return np.asarray((b - a + np.pi) % (2 * np.pi) - np.pi)
+
+
+def motor_rates(eq: Equilibrium) -> np.ndarray:
+    """dq/dp that keeps the tip in balance, -G^-1 K [rad/m]."""
+    return -np.linalg.solve(eq.dforce_dq, eq.dforce_dp)
+
+
+def step(
+    solver: RodSolver, start: Equilibrium, direction: np.ndarray, size: float, *, to_tip: bool
+) -> Equilibrium | str:
+    """One step along the branch while the tip moves straight, from the pose at which the solver stands.
+
+    F(start.p + s direction, q) = 0 is a curve in (s, q). Its tangent predicts; Newton's method corrects, at the wanted
+    tip (``to_tip``, size in m) or in the plane across the tangent (size in rad), where it passes a fold of q(s).
+
+    Returns
+    -------
+    Equilibrium or str
+        The pose, or why it is not one to go on from.
+    """
+    robot = solver.robot
+    tolerance = BALANCED * float((robot.stiffnesses / robot.lengths**2).sum())
+    scaled = METRES_PER_RADIAN * direction
+    tangent = np.append(1.0, motor_rates(start) @ scaled)
+    if to_tip:
+        predicted, across = tangent * size / METRES_PER_RADIAN, np.array([1.0, 0.0, 0.0])
+    else:
+        across = tangent / np.linalg.norm(tangent)
+        predicted = across * size
+    length = float(np.linalg.norm(predicted))
+    if length > LONGEST_STEP:
+        return "lost"
+    moved = predicted
+    try:
+        for _ in range(6):
+            p, q = start.p + moved[0] * scaled, start.q + moved[1:]
+            if stretch(robot, p) >= 1:
+                return "reach"
+            solver.move(p, q, continuation=False)
+            force, (stiffness, coupling) = solver.force(), solver.jacobians()
+            if np.linalg.norm(force) <= tolerance:
+                break
+            jacobian = np.vstack([np.column_stack([stiffness @ scaled, coupling]), across])
+            moved = moved - np.linalg.solve(jacobian, np.append(force, across @ (moved - predicted)))
+        else:
+            return "lost"
+    except (PCRError, np.linalg.LinAlgError):
+        return "lost"
+    if np.linalg.norm(moved - predicted) > 0.3 * length + SAME:
+        return "lost"  # the branch is too curved for this step, or it is another one
+    if solver.unstable_rods():
+        return "rod limit"
+    if np.linalg.det(coupling) * np.linalg.det(start.dforce_dq) <= 0:
+        return "type 1"
+    pose = solver.equilibrium(p, q)
+    return pose if pose.stable else "type 2"
+
+
+def follow(solver: RodSolver, start: Equilibrium, target: np.ndarray) -> Equilibrium | End:
+    """Follow the balanced stable pose while the tip moves straight to ``target``."""
+    direction = (target - start.p) / np.linalg.norm(target - start.p)
+    distance = min(float(np.linalg.norm(target - start.p)), distance_to_reach(solver.robot, start.p, direction))
+    pose, size, reason = start, FIRST_STEP, "lost"
+    solver.start(pose.p, pose.q, pose.nodes)
+    for _ in range(MOST_STEPS):
+        left = distance - float((pose.p - start.p) @ direction)
+        trial = step(solver, pose, direction, left, to_tip=True)
+        if isinstance(trial, Equilibrium):
+            return trial if np.allclose(trial.p, target, atol=1e-9) else End(trial, "reach")
+        while True:
+            go_back(solver, pose)
+            if size < SHORTEST_STEP:
+                return End(pose, reason)
+            trial = step(solver, pose, direction, size, to_tip=False)
+            if isinstance(trial, Equilibrium) and (trial.p - start.p) @ direction < distance:
+                break
+            size, reason = size / 2, trial if isinstance(trial, str) else "lost"
+        pose, size = trial, min(1.5 * size, LONGEST_STEP)
+    return End(pose, "lost")
+
+
+def go_back(solver: RodSolver, pose: Equilibrium) -> None:
+    """Take the solver, which is near, back to a pose."""
+    try:
+        solver.move(pose.p, pose.q)
+    except PCRError:
+        solver.start(pose.p, pose.q, pose.nodes)
+
+
+def distance_to_reach(robot: Robot, p: np.ndarray, direction: np.ndarray) -> float:
+    """How far the tip may go before a rod is stretched to `REACH` [m]."""
+    arm = p - robot.bases
+    along = arm @ direction
+    return float((np.sqrt(along**2 + (REACH * robot.lengths) ** 2 - (arm**2).sum(axis=1)) - along).min())
+
+
+def explore(start: Equilibrium, spacing: float, most: int | None = None) -> Sheet:
+    """All poses of the lattice that stable motion connects with ``start``, or the first ``most`` of them."""
+    sheet = make_sheet(start.robot, spacing)
+    solver = RodSolver(start.robot, closed_form_method())
+    first = min(sheet.tips, key=lambda site: float(np.linalg.norm(sheet.tips[site] - start.p)))
+    sheet.poses[first] = inverse_statics(start.robot, sheet.tips[first], guess=start)
+    waiting = deque([first])
+    with tqdm(total=most or len(sheet.tips), desc=f"mode {start.mode}", unit="tip") as progress:
+        while waiting:
+            progress.update()
+            site = waiting.popleft()
+            pose = sheet.poses[site]
+            for neighbour in neighbours(site):
+                known = sheet.poses.get(neighbour)
+                if known is not None and smooth_between(pose, known):
+                    continue
+                reached = follow(solver, pose, sheet.position(neighbour))
+                if isinstance(reached, End):
+                    sheet.ends[site, neighbour] = reached
+                elif known is None:
+                    if most is None or len(sheet.poses) < most:
+                        sheet.poses[neighbour] = reached
+                        waiting.append(neighbour)
+                elif np.abs(turn_between(known.q, reached.q)).max() > SAME:
+                    sheet.ends[site, neighbour] = End(pose, "overlap")
+    return sheet
+
+
+def neighbours(site: Site) -> list[Site]:
+    """The six around a site, counter-clockwise."""
+    return [(site[0] + i, site[1] + j) for i, j in NEIGHBOURS]
+
+
+def smooth_between(a: Equilibrium, b: Equilibrium) -> bool:
+    """Whether the tangents at both poses account for the motor motion between them: they are on one sheet."""
+    if np.linalg.det(a.dforce_dq) * np.linalg.det(b.dforce_dq) <= 0:
+        return False
+    predicted = (motor_rates(a) + motor_rates(b)) @ (b.p - a.p) / 2
+    return bool(
+        np.linalg.norm(predicted) < LONGEST_STEP
+        and np.linalg.norm(turn_between(a.q, b.q) - predicted) < 0.1 * np.linalg.norm(predicted) + SAME
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A sheet cut into polygons, up to its edge.
+
+    Attributes
+    ----------
+    vertices : list of Equilibrium
+        Poses of the sites, then the ends.
+    sites : list of tuple
+        The site each vertex belongs to.
+    polygons : list of list of int
+        Counter-clockwise in tip space.
+    border : ndarray, shape (B, 2)
+        Vertices at both ends of each stretch of the edge.
+    reasons : list of str
+        Why the sheet ends there.
+    """
+
+    vertices: list[Equilibrium]
+    sites: list[Site]
+    polygons: list[list[int]]
+    border: np.ndarray
+    reasons: list[str]
+
+    def triangles(self) -> np.ndarray:
+        """The polygons cut further, shape (T, 3)."""
+        return np.array([(a, b, c) for a, *rest in self.polygons for b, c in itertools.pairwise(rest)])
+
+
+def make_mesh(sheet: Sheet) -> Mesh:
+    """Cut the lattice's triangles where the paths along their sides ended."""
+    keys: list[Any] = [*sheet.poses, *sheet.ends]
+    index = {key: i for i, key in enumerate(keys)}
+    polygons, border, reasons = [], [], []
+    for i, j in {(i + a, j + b) for i, j in sheet.poses for a in (-1, 0) for b in (-1, 0)}:
+        for triangle in ([(i, j), (i + 1, j), (i, j + 1)], [(i + 1, j), (i + 1, j + 1), (i, j + 1)]):
+            for polygon in cut_triangle(sheet, triangle):
+                polygons.append([index[key] for key in polygon])
+                for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+                    if a in sheet.ends and b in sheet.ends:
+                        border.append((index[a], index[b]))
+                        reasons.append(sheet.ends[a].reason)
+    vertices = [*sheet.poses.values(), *(end.pose for end in sheet.ends.values())]
+    sites = [*sheet.poses, *(site for site, _ in sheet.ends)]
+    return Mesh(vertices, sites, polygons, np.array(border, dtype=int).reshape(-1, 2), reasons)
+
+
+def cut_triangle(sheet: Sheet, triangle: list[Site]) -> list[list[Any]]:
+    """Polygons, as keys of poses and ends, around each group of linked corners of one triangle."""
+    before, after = triangle[2:] + triangle[:2], triangle[1:] + triangle[:1]
+    around = {}  # corner -> its part of a polygon
+    for last, corner, following in zip(before, triangle, after, strict=True):
+        if corner in sheet.poses:
+            keys = [(corner, last), corner, (corner, following)]
+            around[corner] = [key for key in keys if key in sheet.poses or key in sheet.ends]
+    groups = [[corner] for corner in around]
+    for a, b in zip(triangle, after, strict=True):
+        if sheet.linked(a, b):
+            joined = [group for group in groups if a in group or b in group]
+            groups = [group for group in groups if group not in joined] + [list(itertools.chain(*joined))]
+    polygons = [[key for corner in triangle if corner in group for key in around[corner]] for group in groups]
+    return [polygon for polygon in polygons if len(polygon) > 2]
+
+
+def stop_distance(robot: Robot, q: np.ndarray) -> float:
+    """How far a motor is beyond its nearer stop, the worst of all; negative within [rad]."""
+    lower, upper = robot.angle_limits.T
+    return float((np.abs(turn_between((lower + upper) / 2, q)) - (upper - lower) / 2).max())
+
+
+def in_window(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """The same motor angles within half a turn of the middle of each range [rad]."""
+    middle = robot.angle_limits.mean(axis=1)
+    return np.asarray(middle + turn_between(middle, q))
+
+
+def connected_within_stops(sheet: Sheet) -> set[Site]:
+    """Sites that the motors reach from the first pose without leaving their stops."""
+    first = next(iter(sheet.poses))
+    found, waiting = {first}, [first]
+    while waiting:
+        site = waiting.pop()
+        for other in neighbours(site):
+            if (
+                other not in found
+                and sheet.linked(site, other)
+                and stop_distance(sheet.robot, sheet.poses[other].q) <= 0
+            ):
+                found.add(other)
+                waiting.append(other)
+    return found
+
+
+def areas(sheet: Sheet) -> dict[str, float]:
+    """Areas in tip space, in units of L^2 [-]: the whole sheet, within the stops, and the connected part of that."""
+    mesh = make_mesh(sheet)
+    inside = np.array([stop_distance(sheet.robot, eq.q) <= 0 for eq in mesh.vertices])
+    connected = connected_within_stops(sheet)
+    joined = inside & np.array([site in connected for site in mesh.sites])
+    p = np.array([eq.p for eq in mesh.vertices]) / sheet.robot.lengths.min()
+    total = np.zeros(3)
+    for polygon in mesh.polygons:
+        x, y = p[polygon].T
+        area = float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+        total += area * np.array([1.0, inside[polygon].mean(), joined[polygon].mean()])
+    return dict(zip(("stable", "within_stops", "connected_within_stops"), total.tolist(), strict=True))
+
+
+def pose_rows(sheet: Sheet, mode: str) -> list[dict[str, object]]:
+    """One row for each tip within reach: the pose that holds it, or why there is none."""
+    rows: list[dict[str, object]] = []
+    for site, p in sheet.tips.items():
+        row: dict[str, object] = {"mode": mode, "x": f"{p[0]:.6f}", "y": f"{p[1]:.6f}"}
+        if site in sheet.poses:
+            eq = sheet.poses[site]
+            verdict = assess_stability(eq)
+            figures = {
+                **dict(zip(("q0", "q1"), in_window(sheet.robot, eq.q), strict=True)),
+                **dict(zip(("k_soft", "k_stiff"), verdict.stiffness_eigenvalues, strict=True)),
+                **dict(zip(("rod_margin_0", "rod_margin_1"), verdict.rod_margins, strict=True)),
+                "motor_authority": verdict.motor_authority,
+                "det_g": float(np.linalg.det(eq.dforce_dq)),
+            }
+            row.update({name: f"{value:.6g}" for name, value in figures.items()})
+            row |= {"stable": verdict.stable, "within_stops": stop_distance(sheet.robot, eq.q) <= 0}
+        else:
+            towards = [end for (_, to), end in sheet.ends.items() if to == site]
+            row["failure"] = describe(towards[0]) if towards else "not tried: none of its neighbours has a pose"
+        rows.append(row)
+    return rows
+
+
+def describe(end: End) -> str:
+    """One line about where a path ended, with the figures that show why."""
+    eq, verdict = end.pose, assess_stability(end.pose)
+    return (
+        f"{end.reason}: the path to this tip ends at p = {eq.p.round(5)} m, q = {eq.q.round(4)} rad, where K has "
+        f"eigenvalues {eq.stiffness_eigenvalues.round(4)} N/m, G the smallest singular value "
+        f"{verdict.motor_authority:.3g} N/rad, and the rods are at {(1 - verdict.rod_margins).round(3)} of their limits"
+    )
+
+
+def edge_rows(sheet: Sheet, mode: str) -> list[dict[str, object]]:
+    """One row for each point found on the edge of the sheet: the last stable pose before it, and the reason."""
+    rows: list[dict[str, object]] = []
+    for end in sheet.ends.values():
+        values = [*end.pose.p, *in_window(sheet.robot, end.pose.q)]
+        texts = [mode, end.reason, *(f"{value:.6g}" for value in values)]
+        rows.append(dict(zip(EDGE_COLUMNS, texts, strict=True)))
+    return rows
+
+
+def plot(sheet: Sheet, mode: str, path: Path) -> None:
+    """Left: tip positions; right: the motor angles that hold them, over one turn around the middle of their range."""
+    robot, mesh = sheet.robot, make_mesh(sheet)
+    figure, (tip, motors) = plt.subplots(1, 2, figsize=(11, 5.7), layout="constrained")
+    p = np.array([eq.p for eq in mesh.vertices])
+    q = np.array([in_window(robot, eq.q) for eq in mesh.vertices])
+    colours = draw_sheet(tip, mesh, p[mesh.triangles()], p[mesh.border])
+    for turns in itertools.product((-1, 0, 1), repeat=2):
+        # What crosses the edge of the window is drawn whole, at either side.
+        places = [unwrapped(q[indices] + 2 * np.pi * np.array(turns)) for indices in (mesh.triangles(), mesh.border)]
+        draw_sheet(motors, mesh, *places)
+    draw_stops(tip, motors, mesh, p)
+    first = next(iter(sheet.poses.values()))
+    for line in first.shape(60):
+        tip.plot(*line.T, color="black", lw=1.2)
+        tip.plot(*line[0], "s", color="black", ms=6)
+    tip.plot(*first.p, "o", color="black", ms=5)
+    tip.set(xlabel="x [m]", ylabel="y [m]", title=f"Tip space, mode {mode}")
+    low, high = p.min(axis=0) - 0.02, p.max(axis=0) + 0.02
+    tip.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    middle = robot.angle_limits.mean(axis=1)
+    motors.set(xlabel="motor angle q0 [rad]", ylabel="motor angle q1 [rad]", title="Motor space")
+    motors.set(xlim=(middle[0] - np.pi, middle[0] + np.pi), ylim=(middle[1] - np.pi, middle[1] + np.pi))
+    for axes in (tip, motors):
+        axes.set_aspect("equal")
+        axes.grid(False)
+    label = "softest stiffness of the tip [N/m]"
+    figure.colorbar(colours, ax=[tip, motors], label=label, extend="both", pad=0.02, shrink=0.85)
+    handles = [plt.Line2D([], [], color=COLOURS[r], lw=3, label=LABELS[r]) for r in LABELS if r in mesh.reasons]
+    handles.append(plt.Line2D([], [], color="black", ls="--", label="stops of the motors (pale: beyond)"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def draw_sheet(axes: Any, mesh: Mesh, triangles: np.ndarray, border: np.ndarray) -> Any:
+    """Draw stiffness and edge, placed at (T, 3, 2) and (B, 2, 2)."""
+    softest = np.array([eq.stiffness_eigenvalues[0] for eq in mesh.vertices])[mesh.triangles()]
+    colours = axes.tripcolor(
+        *triangles.reshape(-1, 2).T,
+        np.arange(softest.size).reshape(-1, 3),
+        softest.ravel(),
+        shading="gouraud",
+        cmap="viridis",
+        norm=LogNorm(SOFTEST, STIFFEST),
+    )
+    edge = LineCollection(
+        list(border), colors=[COLOURS[r] for r in mesh.reasons], linewidths=3, capstyle="round", zorder=3
+    )
+    axes.add_collection(edge)
+    return colours
+
+
+def draw_stops(tip: Any, motors: Any, mesh: Mesh, p: np.ndarray) -> None:
+    """Fade what the stops of the motors forbid, and draw the line on which a motor meets one."""
+    robot = mesh.vertices[0].robot
+    beyond = np.array([stop_distance(robot, eq.q) for eq in mesh.vertices])
+    if beyond.min() < 0 < beyond.max():
+        tip.tricontourf(*p.T, mesh.triangles(), beyond, levels=[0, np.pi], colors="white", alpha=0.55)
+        tip.tricontour(*p.T, mesh.triangles(), beyond, levels=[0], colors="black", linestyles="--", linewidths=1.6)
+    lower, upper = robot.angle_limits.T
+    around = [plt.Rectangle(lower - 2 * np.pi, *(upper - lower + 4 * np.pi)), plt.Rectangle(lower, *(upper - lower))]
+    outer, inner = (patch.get_patch_transform().transform_path(patch.get_path()) for patch in around)
+    # Wound the other way round, the inner rectangle is a hole.
+    frame = MarkerPath.make_compound_path(outer, MarkerPath(inner.vertices[::-1], inner.codes))
+    motors.add_patch(PathPatch(frame, color="white", alpha=0.55, lw=0))
+    motors.add_patch(plt.Rectangle(lower, *(upper - lower), fill=False, ls="--", lw=1.6, zorder=4))
+
+
+def unwrapped(angles: np.ndarray) -> np.ndarray:
+    """Motor angles of shape (..., k, n), each row of k within half a turn of its first."""
+    return np.asarray(angles[..., :1, :] + turn_between(angles[..., :1, :], angles))
+
+
+def write(path: Path, columns: tuple[str, ...], rows: list[dict[str, object]]) -> None:
+    """CSV with a header."""
+    with open(path, "w", newline="", encoding="utf-8") as handle:
+        writer = csv.DictWriter(handle, fieldnames=columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def main() -> None:
+    """Explore each mode, write the CSVs, draw, print the areas."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("results/workspace"), help="folder for pictures and CSVs")
+    parser.add_argument("--modes", nargs="+", default=list(MODES), choices=("LR", "RL", "LL", "RR"),
+                        help="sides to which the rods bow at their tips (default LR RL LL; RR mirrors LL)")  # fmt: skip
+    parser.add_argument("--spacing", type=float, default=12.0, help="of the lattice of tips [mm] (default 12)")
+    parser.add_argument("--quick", action="store_true", help="the first 40 tips of mode LL, 30 mm apart: some seconds")
+    options = parser.parse_args()
+    modes, spacing, most = (["LL"], 0.03, 40) if options.quick else (options.modes, 1e-3 * options.spacing, None)
+    options.out.mkdir(parents=True, exist_ok=True)
+    robot = load_robot(Path(__file__).parent.parent / "models" / "planar_pair.toml")
+    poses: list[dict[str, object]] = []
+    edges: list[dict[str, object]] = []
+    for mode in modes:
+        sheet = explore(inverse_statics(robot, SEED_TIP, mode=mode), spacing, most)
+        poses += pose_rows(sheet, mode)
+        edges += edge_rows(sheet, mode)
+        plot(sheet, mode, options.out / ("workspace.png" if mode == "LR" else f"workspace_{mode}.png"))
+        figures = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in areas(sheet).items())
+        ends = Counter(end.reason for end in sheet.ends.values())
+        print(f"mode {mode}: areas in L^2: {figures}; points on the edge: {dict(ends)}")
+    write(options.out / "workspace.csv", POSE_COLUMNS, poses)
+    write(options.out / "workspace_edge.csv", EDGE_COLUMNS, edges)
+    print(f"written to {options.out}")
+
+
+if __name__ == "__main__":
+    main()
