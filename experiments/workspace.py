@@ -443,7 +443,8 @@ def plot(sheet: Sheet, mode: str, path: Path) -> None:
         tip.plot(*line[0], "s", color="black", ms=6)
     tip.plot(*first.p, "o", color="black", ms=5)
     tip.set(xlabel="x [m]", ylabel="y [m]", title=f"Tip space, mode {mode}")
-    low, high = p.min(axis=0) - 0.02, p.max(axis=0) + 0.02
+    shown = np.concatenate([p, *first.shape(60)])
+    low, high = shown.min(axis=0) - 0.02, shown.max(axis=0) + 0.02
     tip.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     middle = robot.angle_limits.mean(axis=1)
     motors.set(xlabel="motor angle q0 [rad]", ylabel="motor angle q1 [rad]", title="Motor space")
