@@ -25,6 +25,12 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/finite_differences.py --out docs
 	$(BIN)/python experiments/equilibria.py --out docs
 	$(BIN)/python experiments/time_step_limits.py --out docs
+	$(BIN)/python experiments/snap.py --out docs
+	$(BIN)/python experiments/workspace.py --out results/workspace
+	cp results/workspace/*.png docs/
+	$(BIN)/python experiments/basins.py --seeds 3 --out results/basins
+	cp results/basins/*.png docs/
+	$(BIN)/python experiments/linear_validity.py --out docs
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
 	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
 
