@@ -191,7 +191,7 @@ def test_a_reference_out_of_reach_says_when(lemniscate):
 def test_fallbacks_are_counted(lemniscate):
     """One OSQP iteration never solves: after the first plan every step falls back, and says so."""
     scene = replace(lemniscate, duration=0.1)
-    tuning = replace(load_tuning(CONTROLLERS / "default.toml"), fallback="shifted_plan")
+    tuning = replace(load_tuning(CONTROLLERS / "default.toml"), fallback="ladder")
     controller = make_controller(scene, tuning)
     controller.start(scene.start())
 
@@ -203,14 +203,15 @@ def test_fallbacks_are_counted(lemniscate):
 
         def step(self, k, x):
             if k == 1:
-                for solver in (controller.mpc._workspace.rates_only, controller.mpc._workspace.complete):
+                workspace = controller.mpc._workspace
+                for solver in (workspace.rates_only, workspace.complete, workspace.softened._solver):
                     solver._settings["max_iter"] = 1
                     solver.reset()
             return controller.step(k, x)
 
     run = simulate(scene, scene.make_plant(), Starved())
     assert run.summary()["fallbacks"] == 9
-    assert run.events[0]["message"].endswith("shifted_plan")
+    assert run.events[0]["rung"] == "shifted_plan"
 
 
 def test_saved_runs_read_back(run, tmp_path):

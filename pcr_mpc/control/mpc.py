@@ -15,6 +15,7 @@ from ..frozen import freeze
 from ..linearisation.linear_model import LinearModel
 from .osqp_solver import QPSolver, Solution
 from .qp import QuadraticProgram, Reference, build_qp, constraint_matrix, model_sequence
+from .softened import SoftenedQP
 from .tuning import Limits, Tuning
 
 
@@ -31,9 +32,11 @@ class Plan:
     models : LinearModel or sequence of N
         What it was predicted with.
     status : str
-        "solved", or the solver's word for what went wrong.
-    fallback : str or None
-        What replaced an unsolved QP.
+        "solved", or what went wrong.
+    fallback : {None, "softened", "shifted_plan", "lqr", "hold"}
+        Rung of the ladder that answered instead (see `LinearMPC`).
+    slack : float
+        By how much the angle limits had to give [rad].
     iterations : int
         Of OSQP.
     primal_residual, dual_residual : float
@@ -44,9 +47,10 @@ class Plan:
 
     inputs: np.ndarray
     x: np.ndarray
-    models: LinearModel | Sequence[LinearModel]
+    models: LinearModel | Sequence[LinearModel] | None
     status: str
     fallback: str | None
+    slack: float
     iterations: int
     primal_residual: float
     dual_residual: float
@@ -59,6 +63,8 @@ class Plan:
     @cached_property
     def states(self) -> np.ndarray:
         """Predicted states, the current one first, shape (N + 1, 4 + n)."""
+        if self.models is None:
+            raise ValueError(f"no model to predict with: {self.status}")
         states = [self.x]
         for k, u in enumerate(self.inputs):
             model = self.models if isinstance(self.models, LinearModel) else self.models[k]
@@ -69,7 +75,10 @@ class Plan:
 class LinearMPC:
     """Tracks a reference with a linear model and hard limits on the motors.
 
-    It remembers the solver's workspace and the last plan; `reset` forgets both.
+    It remembers the solver's workspace and the last plan; `reset` forgets both. Every call answers, and says how:
+    the QP solved; softened, where its angle limits cannot be kept; else the last plan moved on by one period, as long
+    as it lasts; else the LQR of the terminal weight, clipped to the limits; else the motors brought to rest.
+    (With ``fallback = "raise"`` in the tuning only the first answer counts.)
 
     Parameters
     ----------
@@ -82,19 +91,21 @@ class LinearMPC:
         self.limits = limits
         self._workspace: _Workspace | None = None
         self._terminal_weight: np.ndarray | None = None
+        self._gain: np.ndarray | None = None
         self._last: Plan | None = None
+        self._age = 0  # periods since the last plan was solved
 
     def reset(self) -> None:
         """Start afresh: the same calls then give the same plans, bit for bit."""
-        self._last = None
+        self._last, self._age = None, 0
         self._terminal_weight = None
         if self._workspace is not None:
-            self._workspace.rates_only.reset()
-            self._workspace.complete.reset()
+            self._workspace.reset()
 
     def prepare(self, model: LinearModel) -> None:
         """Take the terminal weight from ``model`` and build the solvers; else the first `solve` does it."""
-        self._terminal_weight = terminal_weight(model, self.tuning)
+        self._gain, self._terminal_weight = _riccati(model, self.tuning)
+        self._dt = model.dt
         if self._workspace is None:
             self._workspace = _Workspace(self.tuning, model)
 
@@ -121,8 +132,7 @@ class LinearMPC:
         Raises
         ------
         InfeasibleError
-            The QP was not solved, and the tuning asks to raise or there is no earlier plan to fall back to; or the
-            model has no terminal weight.
+            The QP was not solved, and the tuning asks to raise; or the model has no terminal weight.
         ValueError
             Names an argument that is not finite or of the wrong shape; the controller is as it was before.
         """
@@ -138,26 +148,83 @@ class LinearMPC:
         qp = build_qp(x, models, reference, u_previous, self.tuning, self.limits, self._terminal_weight)
         warm = None if self._last is None else _shifted(self._last.inputs).ravel()
         updated = time.perf_counter()
+        fallback, slack = None, 0.0
         try:
             solution = self._workspace.solve(qp, warm)
+            inputs, status = solution.x, "solved"
         except InfeasibleError as error:
-            spent = updated - began, time.perf_counter() - updated
-            self._last = self._fall_back(error, x, models, u_previous, spent)
-            return self._last
+            if self.tuning.fallback == "raise":
+                raise
+            status = error.status
+            try:
+                softened = self._workspace.softened.solve(qp)
+            except InfeasibleError as again:
+                return self.fall_back(f"{status}; softened: {again.status}", x, reference, u_previous)
+            fallback, solution = "softened", softened.solution
+            inputs, slack = softened.inputs, float(softened.slack.max())
         solved = time.perf_counter()
-        inputs = solution.x.reshape(-1, n)
+        inputs = inputs.reshape(-1, n)
         inputs[0] = self._clipped(inputs[0], u_previous)
+        self._age = 0
         self._last = Plan(
             inputs=inputs,
             x=x.copy(),
             models=models,
-            status="solved",
-            fallback=None,
+            status=status,
+            fallback=fallback,
+            slack=slack,
             iterations=solution.iterations,
             primal_residual=solution.primal_residual,
             dual_residual=solution.dual_residual,
             update_time=updated - began,
             solve_time=solved - updated,
+        )
+        return self._last
+
+    def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
+        """Answer without a QP: because it was not solved, or because there is no model or no measurement.
+
+        Parameters
+        ----------
+        status : str
+            What went wrong.
+        x, reference, u_previous
+            As for `solve`; x may be NaN.
+        """
+        n = len(u_previous)
+        inputs = np.zeros((self.tuning.horizon, n))
+        if self._last is not None and self._age < self.tuning.horizon - 1:
+            fallback = "shifted_plan"
+            inputs = _shifted(self._last.inputs)
+        elif self._gain is not None and np.isfinite(x).all():
+            fallback = "lqr"
+            # Where the reference is now, one period before its first state.
+            wanted, dt = reference.states[0].copy(), self._dt
+            wanted[:2] -= dt * wanted[2:4]
+            wanted[4:] -= dt * reference.inputs[0]
+            u = reference.inputs[0] - self._gain @ (x - wanted)
+            inputs[0] = np.clip(u, (self.limits.angle_lower - x[4:]) / dt, (self.limits.angle_upper - x[4:]) / dt)
+        else:
+            fallback = "hold"
+        inputs[0] = self._clipped(inputs[0], u_previous)
+        if fallback == "shifted_plan":
+            inputs[-1] = self._clipped(np.zeros(n), inputs[-2] if len(inputs) > 1 else inputs[0])
+        else:
+            for k in range(1, len(inputs)):
+                inputs[k] = self._clipped(np.zeros(n), inputs[k - 1])
+        self._age += 1
+        self._last = Plan(
+            inputs=inputs,
+            x=np.array(x),
+            models=None if self._last is None else self._last.models,
+            status=status,
+            fallback=fallback,
+            slack=0.0,
+            iterations=0,
+            primal_residual=np.nan,
+            dual_residual=np.nan,
+            update_time=0.0,
+            solve_time=0.0,
         )
         return self._last
 
@@ -167,36 +234,9 @@ class LinearMPC:
         within = np.minimum(np.maximum(u, u_previous - change), u_previous + change)
         return np.asarray(np.minimum(np.maximum(within, -rate), rate))
 
-    def _fall_back(
-        self,
-        error: InfeasibleError,
-        x: np.ndarray,
-        models: LinearModel | Sequence[LinearModel],
-        u_previous: np.ndarray,
-        spent: tuple[float, float],
-    ) -> Plan:
-        if self.tuning.fallback == "raise" or self._last is None:
-            raise error
-        # The plan moved on by one period; past its end the motors come to rest.
-        inputs = _shifted(self._last.inputs)
-        inputs[-1] = self._clipped(np.zeros(inputs.shape[1]), inputs[-1])
-        inputs[0] = self._clipped(inputs[0], u_previous)
-        return Plan(
-            inputs=inputs,
-            x=x.copy(),
-            models=models,
-            status=error.status,
-            fallback="shifted_plan",
-            iterations=error.details.get("iterations", 0),
-            primal_residual=np.nan,
-            dual_residual=np.nan,
-            update_time=spent[0],
-            solve_time=spent[1],
-        )
-
 
 class _Workspace:
-    """Two solvers for the same problem: one that knows the limits on the rates alone, and one that knows all."""
+    """Solvers for the same problem: one knows the limits on the rates alone, one knows all, one has some softened."""
 
     def __init__(self, tuning: Tuning, model: LinearModel) -> None:
         self.n, self.dt = model.B.shape[1], model.dt
@@ -205,6 +245,12 @@ class _Workspace:
         self._dense = matrix.toarray()
         self.complete = QPSolver(matrix, tuning.tolerance, tuning.max_iterations)
         self.rates_only = QPSolver(matrix[: matrix.shape[1]].tocsc(), tuning.tolerance, tuning.max_iterations)
+        self.softened = SoftenedQP(tuning, matrix, self.n, self.dt)
+
+    def reset(self) -> None:
+        """Start afresh."""
+        for solver in (self.rates_only, self.complete, self.softened):
+            solver.reset()
 
     def require(self, model: LinearModel) -> None:
         """Raise if the model is for another robot or period."""
@@ -243,13 +289,18 @@ class _Workspace:
 
 def terminal_weight(model: LinearModel, tuning: Tuning) -> np.ndarray:
     """Cost-to-go of the unconstrained LQR with the tuning's weights, shape (4 + n, 4 + n)."""
+    return _riccati(model, tuning)[1]
+
+
+def _riccati(model: LinearModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
+    """Gain (n, 4 + n) and cost-to-go (4 + n, 4 + n) of the unconstrained LQR."""
     n_states, n = model.B.shape
     # A little weight on the angles keeps the Riccati equation solvable where the tip does not see them all
     # (more than two motors), and changes the gains by less than 0.1 %.
     angle = max(tuning.angle_weight, 1e-6 * tuning.position_weight)
     stage = np.diag([tuning.position_weight] * 2 + [tuning.velocity_weight] * 2 + [angle] * (n_states - 4))
-    _, cost, _ = control.dlqr(model.A, model.B, stage, tuning.input_weight * np.eye(n))
-    return np.asarray(cost)
+    gain, cost, _ = control.dlqr(model.A, model.B, stage, tuning.input_weight * np.eye(n))
+    return np.asarray(gain), np.asarray(cost)
 
 
 def _shifted(inputs: np.ndarray) -> np.ndarray:

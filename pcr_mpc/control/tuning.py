@@ -14,7 +14,7 @@ from .observer import ObserverTuning
 METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 SCHEMES = ("rk4", "rk8")
 LINEARISE = ("here", "along_plan")
-FALLBACKS = ("shifted_plan", "raise")
+FALLBACKS = ("ladder", "raise")
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Tuning:
         OSQP's absolute and relative tolerance.
     max_iterations : int
         After which OSQP gives up.
-    fallback : {"shifted_plan", "raise"}
-        What an unsolved QP leads to: the next input of the last plan, or an error.
+    fallback : {"ladder", "raise"}
+        What an unsolved QP leads to: the next best answer (see `LinearMPC`), or an error.
     model : Model
     observer : ObserverTuning or None
         None: the measured state is taken as it is, and no force is suspected.

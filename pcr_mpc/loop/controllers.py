@@ -119,6 +119,7 @@ class TrackingMPC:
             for plant in (self._model, *(self._along or ())):
                 plant.reset(x, pose)
             self._target.start(pose)
+            self._predicts = resting
             self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
             self._u = np.zeros(self.robot.n_rods)
             self._plan: Plan | None = None
@@ -126,27 +127,39 @@ class TrackingMPC:
                 self.step(0, x)
 
     def step(self, k: int, x: np.ndarray) -> Decision:
-        """See `Controller`."""
+        """See `Controller`; a measurement that is not finite is bridged by the prediction."""
         period, observer = self._scene.period, self.observer
         force = np.zeros(2)
         if observer is not None:
-            observer.correct(x[:2], x[4:])
+            if np.isfinite(x[:2]).all() and np.isfinite(x[4:]).all():
+                observer.correct(x[:2], x[4:])
             x, force = observer.x, observer.force
         began = time.perf_counter()
-        now: LinearModel | None = None
-        ahead = x
-        for u in self._on_the_way:
-            model = linearise(self._model, ahead, u, period, force)
-            now = now or model
-            ahead = model(ahead, u)
-        models = self._linearise(ahead, k, force)
+        failure, now, ahead = "", None, x
+        models: LinearModel | list[LinearModel] | None = None
+        try:
+            for u in self._on_the_way:
+                model = linearise(self._model, ahead, u, period, force)
+                now = now or model
+                ahead = model(ahead, u)
+            models = self._linearise(ahead, k, force)
+        except (PCRError, ValueError) as error:
+            if self._tuning.fallback == "raise":
+                raise
+            failure = f"no linear model: {error}"
         linearised = time.perf_counter() - began
-        plan = self.mpc.solve(ahead, models, self._window(k + self._delay, force), self._u)
+        window = self._window(k + self._delay, force)
+        if models is None:
+            plan = self.mpc.fall_back(failure, ahead, window, self._u)
+        else:
+            plan = self.mpc.solve(ahead, models, window, self._u)
         self._u, self._plan = plan.inputs[0], plan
         self._on_the_way.append(self._u)
         arriving = self._on_the_way.popleft()
+        if models is not None:
+            self._predicts = now or (models if isinstance(models, LinearModel) else models[0])
         if observer is not None:
-            observer.predict(now or (models if isinstance(models, LinearModel) else models[0]), arriving)
+            observer.predict(self._predicts, arriving)
         return Decision(plan.inputs[0], plan, linearised)
 
     def _linearise(self, x: np.ndarray, k: int, force: np.ndarray) -> LinearModel | list[LinearModel]:
@@ -154,7 +167,7 @@ class TrackingMPC:
         if self._along is None:
             return here
         # The last plan, one period on; at the start the reference.
-        if self._plan is None:
+        if self._plan is None or self._plan.models is None or not np.isfinite(self._plan.x).all():
             path = self._states[k + self._delay + 1 :]
         else:
             path = np.vstack([self._plan.states[2:], self._states[k + self._delay + self._tuning.horizon]])

@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -125,6 +126,7 @@ class Run:
         error_mm = 1e3 * self.error
         late = error_mm[self.t >= 1.0]
         kinds = [event["kind"] for event in self.events]
+        rungs = Counter(event["rung"] for event in self.events if event["kind"] == "fallback")
         return {
             "scene": self.scene.name,
             "controller": self.controller,
@@ -153,6 +155,7 @@ class Run:
             "statics_rungs": self.rungs,
             "limit_violations": self.limit_violations(),
             "fallbacks": kinds.count("fallback"),
+            "control_rungs": {"solved": len(self.u) - kinds.count("fallback"), **rungs},
             "snaps": kinds.count("snap"),
             "failures": kinds.count("failure"),
             "events": self.events,

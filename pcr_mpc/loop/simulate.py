@@ -105,7 +105,8 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
                         {
                             "t": k * scene.period,
                             "kind": "fallback",
-                            "message": f"{plan.status}: {plan.fallback}",
+                            "rung": plan.fallback,
+                            "message": f"{plan.fallback}: {plan.status}",
                         }
                     )
             for _ in range(per):
