@@ -18,7 +18,7 @@ from .linear_model import LinearModel
 _TAYLOR_ORDER, _SQUARINGS = 8, 6
 _STIFFEST = 1e3
 # Residual of the statics at which K and G may be taken; their error is of this size.
-_DERIVATIVE_ACCURACY = 1e-6
+DERIVATIVE_ACCURACY = 1e-6
 
 
 def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) -> LinearModel:
@@ -52,7 +52,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     checked_vector("u", u, plant.robot.n_rods)
     f_ext = checked_vector("f_ext", f_ext, 2)
     dt = checked_number("dt", dt, minimum=1e-12)
-    force, k, g = plant.force_and_jacobians(x[:2], x[4:], _DERIVATIVE_ACCURACY)
+    force, k, g = plant.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
     mass, drag = plant.robot.tip_mass, plant.robot.drag
     stiffness, damping = float(np.abs(k).max()) * dt * dt / mass, drag * dt / mass
     if not (stiffness <= _STIFFEST and damping * damping <= _STIFFEST):

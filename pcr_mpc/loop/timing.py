@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from ..linearisation.linearise import DERIVATIVE_ACCURACY
 from ..plant.dynamics import Plant
 from ..plant.statics import METHODS
 from .controllers import make_controller
@@ -28,8 +29,9 @@ def time_scene(scene: Scene, steps: int = 2000, *, progress: bool = False) -> di
     """Measure plant steps of every statics method and the control step of a scene.
 
     Plant steps use velocity Verlet at 1 ms (one force evaluation each) with the scene's discretisation, driven
-    by the inputs of a closed-loop run. Control steps are replayed on the states of that run: back to back, as on
-    a computer that does nothing else, and as they were between the plant's steps.
+    by the inputs of a closed-loop run. Forces with their Jacobians are solved along the same run.
+    Control steps are replayed on the states of that run: back to back, as on a computer that does nothing else,
+    and as they were between the plant's steps.
 
     Returns
     -------
@@ -51,6 +53,7 @@ def time_scene(scene: Scene, steps: int = 2000, *, progress: bool = False) -> di
         plant.reset(run.x[0], pose)
         component = _component("plant step", method, _plant_times(plant, scene, run, n, progress))
         components.append({**component, "force_error": _force_error(plant, scene, run)})
+        components.append(_component("F, K and G", method, _force_times(plant, run, n)))
     if scene.trajectory is not None:
         controller.start(pose)
         states = run.x[:: run.steps_per_period]
@@ -81,6 +84,20 @@ def _plant_times(plant: Plant, scene: Scene, run: Run, n: int, progress: bool) -
         u = run.u[k % lap // per]
         began = time.perf_counter()
         x = plant.step(x, u, scene.force)
+        times[k] = time.perf_counter() - began
+    return times
+
+
+def _force_times(plant: Plant, run: Run, n: int) -> np.ndarray:
+    """Times of n warm solves for force and Jacobians along the run, as the controller's linearisation calls them."""
+    times = np.empty(n)
+    for k in range(n):
+        x = run.x[k % len(run.x)]
+        if k % len(run.x) == 0:
+            plant.reset(x, run.pose)
+        p, q = x[:2].copy(), x[4:].copy()
+        began = time.perf_counter()
+        plant.force_and_jacobians(p, q, DERIVATIVE_ACCURACY)
         times[k] = time.perf_counter() - began
     return times
 
