@@ -11,6 +11,7 @@ from ..plant.robot import Robot
 
 _LARGEST_STEP = 0.1  # rad
 _ROUGH = 1e-2
+_SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
 
 
 class MotorTarget:
@@ -40,6 +41,13 @@ class MotorTarget:
             found, _, g = self._plant.force_and_jacobians(p, q + self._shift, _ROUGH)
         except PCRError:
             return self._shift
-        step = np.linalg.lstsq(g, force - found, rcond=1e-6)[0]
-        self._shift = self._shift + step * min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+        # The least motion: G'(G G')^-1, two by two however many motors there are.
+        (a, b), (_, d) = (g @ g.T).tolist()
+        determinant = a * d - b * b
+        if determinant < _SINGULAR * a * d:
+            return self._shift
+        x, y = (force - found).tolist()
+        step = np.array([d * x - b * y, a * y - b * x]) / determinant @ g
+        largest = max(map(abs, step.tolist()))
+        self._shift = self._shift + (step if largest <= _LARGEST_STEP else step * (_LARGEST_STEP / largest))
         return self._shift
