@@ -138,26 +138,29 @@ class Robot:
             raise ValueError(f"{name} is {q} rad, expected at most {_LARGEST_ANGLE:g} rad; take off the whole turns")
         return q
 
-    def require_reachable(self, p: np.ndarray) -> None:
-        """Raise `UnreachableError` if some rod cannot reach ``p``, shape (2,) [m]."""
+    def slacks(self, p: np.ndarray) -> list[float]:
+        """1 - |p - base| / length of every rod: 0 where it is straight, negative out of reach."""
         x, y = map(float, p)
-        for i, rod in enumerate(self.rods):
-            distance = math.hypot(x - rod.base[0], y - rod.base[1])
-            excess = distance - rod.length
-            margin = _LEAST_SLACK * rod.length
+        return [1.0 - math.hypot(x - rod.base[0], y - rod.base[1]) / rod.length for rod in self.rods]
+
+    def require_reachable(self, p: np.ndarray) -> None:
+        """Raise `UnreachableError` if some rod cannot reach ``p``, shape (2,) [m], or is straight there."""
+        for i, slack in enumerate(self.slacks(p)):
             # Written so that NaN is out of reach.
-            if not excess <= -margin:
+            if not slack >= _LEAST_SLACK:
+                length = self.rods[i].length
+                distance = length * (1.0 - slack)
                 advice = (
-                    "fully stretched it has no definite force; move the tip closer to its base"
-                    if abs(excess) <= margin
-                    else f"move the tip at least {excess:.3g} m closer"
+                    "straight, it has no definite force; move the tip closer to its base"
+                    if abs(slack) < _LEAST_SLACK
+                    else f"move the tip at least {distance - length:.3g} m closer"
                 )
                 raise UnreachableError(
-                    f"tip ({x:.6g}, {y:.6g}) m is {distance:.6g} m from the base of rod {i}, whose length "
-                    f"is {rod.length:.6g} m; {advice}",
+                    f"tip ({p[0]:.6g}, {p[1]:.6g}) m is {distance:.6g} m from the base of rod {i}, whose length is "
+                    f"{length:.6g} m; {advice}",
                     rod=i,
                     distance=distance,
-                    length=rod.length,
+                    length=length,
                 )
 
 

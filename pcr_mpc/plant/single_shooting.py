@@ -147,8 +147,7 @@ class SingleShooting:
             except ValueError:  # SciPy's word for a non-finite residual
                 y, evaluations = guess, 1
             norm = float(np.linalg.norm(residual(y)))
-        slack = 1.0 - float((np.hypot(*(p - self.robot.bases).T) / self.robot.lengths).max())
-        if not norm <= min(_ACCEPTED_RESIDUAL, _ACCEPTED_FRACTION * slack):
+        if not norm <= min(_ACCEPTED_RESIDUAL, _ACCEPTED_FRACTION * min(self.robot.slacks(p))):
             raise ConvergenceError(
                 f"single shooting at p = {p} m, q = {q} rad stopped with residual {norm:.2e} after {evaluations} "
                 "evaluations; pass a closer guess or use method='multiple_shooting'",

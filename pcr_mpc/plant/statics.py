@@ -104,8 +104,7 @@ def _refined(
 ) -> Equilibrium:
     """Solve with finer and finer integration until the drift says that the rods are resolved."""
     failure: ConvergenceError | None = None
-    slack = 1.0 - float((np.hypot(*(p - robot.bases).T) / robot.lengths).max())
-    wanted = _WANTED_DRIFT[method] * min(1.0, slack / _TAUT)
+    wanted = _WANTED_DRIFT[method] * min(1.0, min(robot.slacks(p)) / _TAUT)
     for steps in _REFINEMENT:
         if segments * steps > _MOST_STEPS:
             break
