@@ -69,6 +69,8 @@ class Table:
     ) -> float:
         """Take a finite number, greater than ``above`` and from ``minimum`` to ``maximum``."""
         value = self._take(key, default)
+        if value is default:
+            return float(default)
         problem = number_problem(value, above=above, minimum=minimum, maximum=maximum)
         if problem:
             raise self.fail(key, problem)

@@ -117,3 +117,20 @@ def test_noise_is_filtered(lemniscate, tuning):
 def test_all_at_once():
     scene = replace(load_scene(SCENES / "sensors.toml"), duration=3.0)
     assert rms_mm(scene, scene.tuning) < 0.2
+
+
+@pytest.mark.parametrize("cost", [0.004, 0.008])
+def test_late_decisions(lemniscate, tuning, cost):
+    """Every decision is 8 ms late, or within its deadline of 5 ms."""
+    errors = []
+    for late in ("hold", "shifted_plan"):
+        scene = replace(lemniscate, deadline=0.005, late=late)
+        run = simulate(scene, scene.make_plant(), make_controller(scene, tuning), spent=lambda k, _: cost)
+        summary = run.summary()
+        assert summary["deadline_misses"] == (scene.n_periods if cost > 0.005 else 0)
+        errors.append(summary["rms_after_1s_mm"])
+    in_time = rms_mm(lemniscate, tuning)
+    if cost < 0.005:
+        assert errors == [in_time, in_time]
+    else:
+        assert in_time < errors[1] < 0.5 * errors[0]

@@ -56,7 +56,7 @@ class Run:
     rungs : dict
         How many poses of the plant each rung of the statics' ladder has solved (see `RodSolver`).
     events : list of dict
-        Fall-backs, snaps and failures: time, kind, message.
+        Fall-backs, missed deadlines, snaps and failures: time, kind, message.
     """
 
     scene: Scene
@@ -156,6 +156,7 @@ class Run:
             "limit_violations": self.limit_violations(),
             "fallbacks": kinds.count("fallback"),
             "control_rungs": {"solved": len(self.u) - kinds.count("fallback"), **rungs},
+            "deadline_misses": kinds.count("late"),
             "snaps": kinds.count("snap"),
             "failures": kinds.count("failure"),
             "events": self.events,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from ..plant.statics import METHODS
 from ..toml_table import Table, read_toml
 from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 
+LATE = ("hold", "shifted_plan")
 # Distance of the start from the reference that is taken for the same place [m].
 _START_TOLERANCE = 1e-3
 
@@ -68,6 +70,11 @@ class Scene:
         Resolution of the encoders: measured angles are whole multiples of it [rad]. Zero: exact.
     delay : int
         Control periods that pass before a command reaches the motors.
+    deadline : float
+        Time after the start of a period [s] up to which a decision still counts as taken at its start. A later one
+        reaches the motors as late as it is. Infinite: lateness is not simulated.
+    late : {"hold", "shifted_plan"}
+        What the motors do until a late decision arrives: go on as before, or as the last plan foresaw.
     """
 
     name: str
@@ -85,6 +92,8 @@ class Scene:
     tip_noise: float
     angle_step: float = 0.0
     delay: int = 0
+    deadline: float = math.inf
+    late: str = LATE[0]
 
     @property
     def n_periods(self) -> int:
@@ -166,6 +175,8 @@ def load_scene(path: str | Path) -> Scene:
             period = control.number("period", above=0.0)
             tuning = control.text("tuning", None)
             delay = control.integer("delay", 0, minimum=0)
+            deadline = control.number("deadline", math.inf, minimum=0.0)
+            late = control.text("late", LATE[0], choices=LATE)
             ratio = period / plant.dt
             if duration < period:
                 raise control.fail("period", f"is {period} s, longer than the duration {duration} s")
@@ -178,7 +189,8 @@ def load_scene(path: str | Path) -> Scene:
         with file.table("reference") as reference:
             trajectory = _trajectory(reference)
     scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
-                  tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step, delay)  # fmt: skip
+                  tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
+                  delay, deadline, late)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,15 @@ from .run import Run
 from .scene import Scene
 
 
-def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, *, progress: bool = False) -> Run:
+def simulate(
+    scene: Scene,
+    plant: Plant,
+    controller: Controller,
+    seed: int = 0,
+    *,
+    spent: Callable[[int, float], float] | None = None,
+    progress: bool = False,
+) -> Run:
     """Run a scene in closed loop.
 
     Parameters
@@ -28,6 +38,9 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
         Sees the measured state only, and predicts with a model of its own.
     seed : int
         Of the measurement noise.
+    spent : callable, optional
+        (period, measured seconds) -> seconds that the decision is taken to have cost, where the scene has a deadline.
+        None: what was measured (then the run is not repeatable).
     progress : bool
         Show a progress bar on stderr.
 
@@ -60,6 +73,7 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
     events: list[dict[str, Any]] = []
     states[0] = x
     done, decided, snapped = 0, 0, 0
+    meanwhile = np.zeros(n)
 
     def record() -> Run:
         t = plant.dt * np.arange(done + 1)
@@ -96,6 +110,13 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
             decided = k + 1
             on_the_way.append(decision.u)
             arrived = on_the_way.popleft()
+            cost = float(control_time[k, 0]) if spent is None else spent(k, float(control_time[k, 0]))
+            waiting = 0
+            if cost > scene.deadline:
+                waiting = min(per, math.ceil(cost / plant.dt))
+                events.append(
+                    {"t": k * scene.period, "kind": "late", "message": f"{1e3 * cost:.3g} ms, {scene.late} until then"}
+                )
             if decision.plan is not None:
                 plan = decision.plan
                 control_time[k, 1:] = decision.linearise_time, plan.update_time, plan.solve_time
@@ -109,9 +130,10 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
                             "message": f"{plan.fallback}: {plan.status}",
                         }
                     )
-            for _ in range(per):
+            for j in range(per):
+                u = meanwhile if j < waiting else arrived
                 began = time.perf_counter()
-                x = plant.step(x, arrived, scene.force)
+                x = plant.step(x, u, scene.force)
                 plant_time[done] = time.perf_counter() - began
                 done += 1
                 states[done] = x
@@ -125,6 +147,8 @@ def simulate(scene: Scene, plant: Plant, controller: Controller, seed: int = 0, 
                         }
                     )
                 snapped = len(plant.snaps)
+            foreseen = scene.late == "shifted_plan" and decision.plan is not None and len(decision.plan.inputs) > 1
+            meanwhile = decision.plan.inputs[1] if foreseen and decision.plan is not None else arrived
     except (Exception, KeyboardInterrupt) as error:  # whatever it is, the run so far is kept
         what = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
         t = done * plant.dt
