@@ -99,6 +99,7 @@ class TrackingMPC:
         self._target = MotorTarget(self.robot)
         self._on_the_way: deque[np.ndarray] = deque()
         self._u = np.zeros(self.robot.n_rods)
+        self._plan: Plan | None = None
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference."""
@@ -109,22 +110,25 @@ class TrackingMPC:
         model.reset(x, pose)
         resting = linearise(model, x, np.zeros(self.robot.n_rods), self._scene.period)
         # One throw-away step pays for building graphs and workspaces before the clock runs.
-        for _ in range(2):
-            self.mpc.reset()
-            self.mpc.prepare(resting)
-            if self._tuning.observer is not None:
-                scene = self._scene
-                self.observer = DisturbanceObserver(self._tuning.observer, scene.tip_noise, scene.angle_step, resting)
-                self.observer.start(x)
-            for plant in (self._model, *(self._along or ())):
-                plant.reset(x, pose)
-            self._target.start(pose)
-            self._predicts = resting
-            self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
-            self._u = np.zeros(self.robot.n_rods)
-            self._plan: Plan | None = None
-            if _ == 0:
-                self.step(0, x)
+        self._restart(x, pose, resting)
+        self.step(0, x)
+        self._restart(x, pose, resting)
+
+    def _restart(self, x: np.ndarray, pose: Equilibrium, resting: LinearModel) -> None:
+        """Forget everything: the robot rests in ``pose``, about which ``resting`` is the linear model."""
+        self.mpc.reset()
+        self.mpc.prepare(resting)
+        if self._tuning.observer is not None:
+            sensors = self._scene.tip_noise, self._scene.angle_step
+            self.observer = DisturbanceObserver(self._tuning.observer, *sensors, resting)
+            self.observer.start(x)
+        for plant in (self._model, *(self._along or ())):
+            plant.reset(x, pose)
+        self._target.start(pose)
+        self._predicts = resting
+        self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
+        self._u = np.zeros(self.robot.n_rods)
+        self._plan = None
 
     def step(self, k: int, x: np.ndarray) -> Decision:
         """See `Controller`; a measurement that is not finite is bridged by the prediction."""
