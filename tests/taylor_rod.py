@@ -17,7 +17,7 @@ def solve(log_tip_angle, load, hand, pose):
     Parameters
     ----------
     log_tip_angle, load, hand : ndarray, shape (m,)
-        Of a nearby solution, improved by two Newton steps.
+        Of a nearby solution, improved by a Newton step.
     pose : ndarray, shape (3, m)
         Tip relative to base / L, clamp angle.
 
@@ -28,7 +28,7 @@ def solve(log_tip_angle, load, hand, pose):
     tangents : ndarray, shape (3, 3, m)
         d loads / d pose.
     change : ndarray, shape (m,)
-        Of the unknowns in the second Newton step: how exact this is.
+        Of the unknowns in the Newton step: what is left is of the order of its square.
     """
     loads, tangents = np.empty((3, load.size), REAL), np.empty((3, 3, load.size), REAL)
     change = np.empty(load.size, REAL)
@@ -45,10 +45,9 @@ def _solve(log_tip_angle, load, hand, pose):
     x, y, angle = pose
     cos, sin = np.cos(angle), np.sin(angle)
     target = np.stack([cos * x + sin * y, hand * (cos * y - sin * x)])
-    for _ in range(2):
-        _, _, tip, by_l, by_load, _, _ = _rod(log_tip_angle, load)
-        step = -_solve2(by_l, by_load, tip - target)
-        log_tip_angle, load = log_tip_angle + step[0], load + step[1]
+    _, _, tip, by_l, by_load, _, _ = _rod(log_tip_angle, load)
+    step = -_solve2(by_l, by_load, tip - target)
+    log_tip_angle, load = log_tip_angle + step[0], load + step[1]
     delta, rate, _, by_l, by_load, delta_l, rate_l = _rod(log_tip_angle, load)
     psi = angle + hand * delta
     force = load**2 * np.stack([np.cos(psi), np.sin(psi)])

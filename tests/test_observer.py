@@ -20,7 +20,7 @@ def tuning():
 
 @pytest.fixture(scope="module")
 def lemniscate():
-    return replace(load_scene(SCENES / "lemniscate.toml"), duration=2.5)
+    return replace(load_scene(SCENES / "lemniscate.toml"), duration=1.8)
 
 
 def rms_mm(scene, tuning):
@@ -115,14 +115,14 @@ def test_noise_is_filtered(lemniscate, tuning):
 
 
 def test_all_at_once():
-    scene = replace(load_scene(SCENES / "sensors.toml"), duration=3.0)
+    scene = replace(load_scene(SCENES / "sensors.toml"), duration=2.0)
     assert rms_mm(scene, scene.tuning) < 0.2
 
 
 @pytest.mark.parametrize("cost", [0.004, 0.008])
 def test_late_decisions(lemniscate, tuning, cost):
     """Every decision is 8 ms late, or within its deadline of 5 ms."""
-    errors = []
+    lemniscate, errors = replace(lemniscate, duration=2.5), []
     for late in ("hold", "shifted_plan"):
         scene = replace(lemniscate, deadline=0.005, late=late)
         run = simulate(scene, scene.make_plant(), make_controller(scene, tuning), spent=lambda k, _: cost)
