@@ -45,7 +45,9 @@ from pcr_mpc import (
     simulate,
     solve_statics,
 )
-from pcr_mpc.loop.controllers import Controller, Decision, feed_forward, motor_limits
+from pcr_mpc.loop.controllers import Controller, Decision
+from pcr_mpc.loop.feed_forward import feed_forward
+from pcr_mpc.loop.tracking import motor_limits
 from pcr_mpc.loop.trajectory import Lemniscate
 from pcr_mpc.report.style import BLUE, GREY, RED, plt
 
@@ -297,7 +299,7 @@ class LinearisedOnce:
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`."""
         scene, plant = self._scene, self._scene.make_plant()
-        self._states, self._inputs, _ = feed_forward(scene, scene.robot, pose, self._mpc.tuning.horizon)
+        self._reference = feed_forward(scene, scene.robot, pose, self._mpc.tuning.horizon)
         x = np.concatenate([pose.p, [0.0, 0.0], pose.q])
         plant.reset(x, pose)
         self._u = np.zeros(scene.robot.n_rods)
@@ -307,7 +309,8 @@ class LinearisedOnce:
     def step(self, k: int, x: np.ndarray) -> Decision:
         """See `Controller`."""
         horizon = self._mpc.tuning.horizon
-        window = Reference(self._states[k + 1 : k + 1 + horizon], self._inputs[k : k + horizon])
+        reference = self._reference
+        window = Reference(reference.states[k + 1 : k + 1 + horizon], reference.inputs[k : k + horizon])
         plan = self._mpc.solve(x, self._model, window, self._u)
         self._u = plan.inputs[0]
         return Decision(self._u, plan)

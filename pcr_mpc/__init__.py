@@ -1,6 +1,7 @@
 """Model-predictive control of planar parallel continuum robots."""
 
-from .control.mpc import LinearMPC, Plan
+from .control.mpc import LinearMPC
+from .control.plan import Plan
 from .control.qp import QuadraticProgram, Reference, build_qp
 from .control.tuning import Limits, Tuning, load_tuning
 from .errors import (
@@ -14,10 +15,11 @@ from .errors import (
 )
 from .linearisation.linear_model import LinearModel
 from .linearisation.linearise import linearise
-from .loop.controllers import HoldMotors, TrackingMPC, make_controller
+from .loop.controllers import HoldMotors
 from .loop.run import Run
 from .loop.scene import Scene, load_scene
 from .loop.simulate import simulate
+from .loop.tracking import TrackingController, make_controller
 from .plant.dynamics import Plant
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
@@ -45,7 +47,7 @@ __all__ = [
     "Scene",
     "SimulationError",
     "Stability",
-    "TrackingMPC",
+    "TrackingController",
     "Tuning",
     "UnreachableError",
     "UnstableError",

@@ -13,11 +13,11 @@ from typing import Any
 
 from .control.tuning import load_tuning
 from .errors import PCRError, SimulationError
-from .loop.controllers import make_controller
 from .loop.run import Run
 from .loop.scene import load_scene
 from .loop.simulate import simulate
 from .loop.timing import time_scene
+from .loop.tracking import make_controller
 from .plant.dynamics import Plant
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics

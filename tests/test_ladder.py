@@ -16,10 +16,10 @@ from pcr_mpc import (
     make_controller,
     simulate,
 )
+from pcr_mpc.control.limited_qp import LimitedQP
 from pcr_mpc.control.mpc import terminal_weight
 from pcr_mpc.control.osqp_solver import QPSolver
-from pcr_mpc.control.qp import build_qp, constraint_matrix
-from pcr_mpc.control.softened import SoftenedQP
+from pcr_mpc.control.qp import build_qp
 from pcr_mpc.control.tuning import Limits
 
 from .conftest import CONTROLLERS, MODELS
@@ -70,7 +70,8 @@ def test_softened_returns_from_beyond_a_stop(mpc, target, model, reference, pair
         assert np.abs(plan.inputs[0]).max() <= RATE
         rungs.append(plan.fallback)
         if plan.fallback:
-            assert plan.slack > 0
+            assert plan.slack["angle"] > 0
+            assert "angle" in plan.active
             assert "infeasible" in plan.status
         u = plan.inputs[0]
         x = model(x, u)
@@ -90,9 +91,11 @@ def test_the_penalty_is_exact(tuning, target, model, reference, pair):
     hard.update(qp.P, qp.q, qp.l, qp.u)
     solution = hard.solve()
     assert np.abs(solution.y[4 * tuning.horizon :]).max() > 1e-3  # an angle limit is active
-    softened = SoftenedQP(tuning, constraint_matrix(tuning.horizon, 2), 2, DT).solve(qp)
-    assert softened.inputs == pytest.approx(solution.x, abs=1e-5)
-    assert np.abs(softened.slack).max() < 1e-7
+    for soft in (True, False):
+        softened = LimitedQP(tuning, 2, DT).solve(qp, x, [model], None, soft_angles=soft)
+        assert softened.inputs == pytest.approx(solution.x, abs=1e-5)
+        assert softened.slack == {}
+        assert softened.active == ("rate change", "angle")
 
 
 def test_shifted_plan_then_lqr_then_hold(mpc, target, model, reference, tuning):

@@ -203,8 +203,8 @@ def test_fallbacks_are_counted(lemniscate):
 
         def step(self, k, x):
             if k == 1:
-                workspace = controller.mpc._workspace
-                for solver in (workspace.rates_only, workspace.complete, workspace.softened._solver):
+                workspace = controller._law._workspace
+                for solver in (workspace._rates_only, *(one._solver for one in workspace._limited.values())):
                     solver._settings["max_iter"] = 1
                     solver.reset()
             return controller.step(k, x)

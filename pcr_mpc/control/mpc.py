@@ -4,81 +4,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import control
 import numpy as np
 
 from ..errors import InfeasibleError, checked_vector
-from ..frozen import freeze
+from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
+from .limited_qp import Limited, LimitedQP, active_kinds
 from .osqp_solver import QPSolver, Solution
-from .qp import QuadraticProgram, Reference, build_qp, constraint_matrix, model_sequence
-from .softened import SoftenedQP
+from .plan import Plan
+from .qp import QuadraticProgram, Reference, Rollout, build_qp, constraint_matrix, model_sequence
 from .tuning import Limits, Tuning
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """Result of one control step.
-
-    Attributes
-    ----------
-    inputs : ndarray, shape (N, n)
-        Motor rates; the first row is to be applied [rad/s].
-    x : ndarray, shape (4 + n,)
-        State it starts from.
-    models : LinearModel or sequence of N
-        What it was predicted with.
-    status : str
-        "solved", or what went wrong.
-    fallback : {None, "softened", "shifted_plan", "lqr", "hold"}
-        Rung of the ladder that answered instead (see `LinearMPC`).
-    slack : float
-        By how much the angle limits had to give [rad].
-    iterations : int
-        Of OSQP.
-    primal_residual, dual_residual : float
-        Recomputed from the QP's data; NaN if unsolved.
-    update_time, solve_time : float
-        Assembling the QP, and handing it over and solving it [s].
-    """
-
-    inputs: np.ndarray
-    x: np.ndarray
-    models: LinearModel | Sequence[LinearModel] | None
-    status: str
-    fallback: str | None
-    slack: float
-    iterations: int
-    primal_residual: float
-    dual_residual: float
-    update_time: float
-    solve_time: float
-
-    def __post_init__(self) -> None:
-        freeze(self)
-
-    @cached_property
-    def states(self) -> np.ndarray:
-        """Predicted states, the current one first, shape (N + 1, 4 + n)."""
-        if self.models is None:
-            raise ValueError(f"no model to predict with: {self.status}")
-        states = [self.x]
-        for k, u in enumerate(self.inputs):
-            model = self.models if isinstance(self.models, LinearModel) else self.models[k]
-            states.append(model(states[-1], u))
-        return np.array(states)
-
-
 class LinearMPC:
-    """Tracks a reference with a linear model and hard limits on the motors.
+    """Tracks a reference with a linear model, hard limits on the motors and soft ones on the pose.
 
     It remembers the solver's workspace and the last plan; `reset` forgets both. Every call answers, and says how:
-    the QP solved; softened, where its angle limits cannot be kept; else the last plan moved on by one period, as long
-    as it lasts; else the LQR of the terminal weight, clipped to the limits; else the motors brought to rest.
-    (With ``fallback = "raise"`` in the tuning only the first answer counts.)
+    the QP solved; softened, where a pose's limits or, from beyond them, the angles' cannot be kept; else the last plan
+    moved on by one period, as long as it lasts; else the LQR of the terminal weight, clipped to the limits; else the
+    motors brought to rest. (With ``fallback = "raise"`` in the tuning only the first two count.)
 
     Parameters
     ----------
@@ -102,12 +49,17 @@ class LinearMPC:
         if self._workspace is not None:
             self._workspace.reset()
 
-    def prepare(self, model: LinearModel) -> None:
-        """Take the terminal weight from ``model`` and build the solvers; else the first `solve` does it."""
-        self._gain, self._terminal_weight = _riccati(model, self.tuning)
+    def prepare(self, model: LinearModel, kinds: tuple[str, ...] = ()) -> None:
+        """Take the terminal weight from ``model`` and build the solvers; else the first `solve` does it.
+
+        ``kinds`` are those of the `LinearLimits` to come.
+        """
+        self._gain, self._terminal_weight = riccati(model, self.tuning)
         self._dt = model.dt
         if self._workspace is None:
             self._workspace = _Workspace(self.tuning, model)
+        for each in {(), kinds}:  # the latter only where a limit comes near
+            self._workspace.limited(each)
 
     def solve(
         self,
@@ -115,6 +67,7 @@ class LinearMPC:
         models: LinearModel | Sequence[LinearModel],
         reference: Reference,
         u_previous: np.ndarray,
+        pose_limits: LinearLimits | None = None,
     ) -> Plan:
         """Plan the motor rates over the horizon.
 
@@ -128,6 +81,8 @@ class LinearMPC:
             Over the horizon.
         u_previous : ndarray, shape (n,)
             Rates applied in the last period [rad/s].
+        pose_limits : LinearLimits, optional
+            To be kept at the end of every period, if they can be.
 
         Raises
         ------
@@ -137,7 +92,8 @@ class LinearMPC:
             Names an argument that is not finite or of the wrong shape; the controller is as it was before.
         """
         began = time.perf_counter()
-        first = model_sequence(models, self.tuning.horizon)[0]
+        sequence = model_sequence(models, self.tuning.horizon)
+        first = sequence[0]
         n_states, n = first.B.shape
         x, u_previous = checked_vector("x", x, n_states), checked_vector("u_previous", u_previous, n)
         if self._terminal_weight is None or self._workspace is None:
@@ -148,34 +104,38 @@ class LinearMPC:
         qp = build_qp(x, models, reference, u_previous, self.tuning, self.limits, self._terminal_weight)
         warm = None if self._last is None else _shifted(self._last.inputs).ravel()
         updated = time.perf_counter()
-        fallback, slack = None, 0.0
+        status, fallback = "solved", None
         try:
-            solution = self._workspace.solve(qp, warm)
-            inputs, status = solution.x, "solved"
+            answer = self._workspace.solve(qp, x, sequence, pose_limits, self.limits, warm)
         except InfeasibleError as error:
             if self.tuning.fallback == "raise":
                 raise
-            status = error.status
+            status, fallback = error.status, "softened"
             try:
-                softened = self._workspace.softened.solve(qp)
+                answer = self._workspace.soften(qp, x, sequence, pose_limits)
             except InfeasibleError as again:
                 return self.fall_back(f"{status}; softened: {again.status}", x, reference, u_previous)
-            fallback, solution = "softened", softened.solution
-            inputs, slack = softened.inputs, float(softened.slack.max())
+        if answer.slack and fallback is None:
+            status, fallback = f"cannot keep {', '.join(answer.slack)}", "softened"
         solved = time.perf_counter()
-        inputs = inputs.reshape(-1, n)
-        inputs[0] = self._clipped(inputs[0], u_previous)
+        inputs = answer.inputs.reshape(-1, n)
+        first_rates = self.limits.clipped(inputs[0], u_previous)
+        states = answer.states
+        if states is None or not np.array_equal(inputs[0], first_rates):
+            inputs[0] = first_rates
+            states = self._workspace.rollout(x, sequence, inputs)
         self._age = 0
         self._last = Plan(
             inputs=inputs,
-            x=x.copy(),
+            states=states,
             models=models,
             status=status,
             fallback=fallback,
-            slack=slack,
-            iterations=solution.iterations,
-            primal_residual=solution.primal_residual,
-            dual_residual=solution.dual_residual,
+            active=answer.active,
+            slack=answer.slack,
+            iterations=answer.solution.iterations,
+            primal_residual=answer.solution.primal_residual,
+            dual_residual=answer.solution.dual_residual,
             update_time=updated - began,
             solve_time=solved - updated,
         )
@@ -198,58 +158,48 @@ class LinearMPC:
             inputs = _shifted(self._last.inputs)
         elif self._gain is not None and np.isfinite(x).all():
             fallback = "lqr"
-            # Where the reference is now, one period before its first state.
-            wanted, dt = reference.states[0].copy(), self._dt
-            wanted[:2] -= dt * wanted[2:4]
-            wanted[4:] -= dt * reference.inputs[0]
-            u = reference.inputs[0] - self._gain @ (x - wanted)
-            inputs[0] = np.clip(u, (self.limits.angle_lower - x[4:]) / dt, (self.limits.angle_upper - x[4:]) / dt)
+            inputs[0] = self.limits.within_stops(lqr_rates(self._gain, x, reference, self._dt), x[4:], self._dt)
         else:
             fallback = "hold"
-        inputs[0] = self._clipped(inputs[0], u_previous)
+        inputs[0] = wanted = self.limits.clipped(asked := inputs[0].copy(), u_previous)
         if fallback == "shifted_plan":
-            inputs[-1] = self._clipped(np.zeros(n), inputs[-2] if len(inputs) > 1 else inputs[0])
+            inputs[-1] = self.limits.clipped(np.zeros(n), inputs[-2] if len(inputs) > 1 else inputs[0])
         else:
             for k in range(1, len(inputs)):
-                inputs[k] = self._clipped(np.zeros(n), inputs[k - 1])
+                inputs[k] = self.limits.clipped(np.zeros(n), inputs[k - 1])
         self._age += 1
-        self._last = Plan(
-            inputs=inputs,
-            x=np.array(x),
-            models=None if self._last is None else self._last.models,
-            status=status,
-            fallback=fallback,
-            slack=0.0,
-            iterations=0,
-            primal_residual=np.nan,
-            dual_residual=np.nan,
-            update_time=0.0,
-            solve_time=0.0,
-        )
+        models, states = None, None
+        if self._last is not None and self._last.models is not None and np.isfinite(x).all():
+            assert self._workspace is not None
+            models = self._last.models
+            states = self._workspace.rollout(x, model_sequence(models, self.tuning.horizon), inputs)
+        active = () if np.array_equal(wanted, asked) else self.limits.met_by(wanted, u_previous)
+        self._last = Plan(inputs, states, models, status, fallback, active)
         return self._last
-
-    def _clipped(self, u: np.ndarray, u_previous: np.ndarray) -> np.ndarray:
-        """Meet the limits on rate and change exactly; OSQP meets them to its tolerance."""
-        rate, change = self.limits.rate, self.limits.rate_change
-        within = np.minimum(np.maximum(u, u_previous - change), u_previous + change)
-        return np.asarray(np.minimum(np.maximum(within, -rate), rate))
 
 
 class _Workspace:
-    """Solvers for the same problem: one knows the limits on the rates alone, one knows all, one has some softened."""
+    """Solvers for the same problem: one knows the limits on the rates alone, the others all of them."""
 
     def __init__(self, tuning: Tuning, model: LinearModel) -> None:
         self.n, self.dt = model.B.shape[1], model.dt
-        self._tolerance = tuning.tolerance
-        matrix = constraint_matrix(tuning.horizon, self.n)
-        self._dense = matrix.toarray()
-        self.complete = QPSolver(matrix, tuning.tolerance, tuning.max_iterations)
-        self.rates_only = QPSolver(matrix[: matrix.shape[1]].tocsc(), tuning.tolerance, tuning.max_iterations)
-        self.softened = SoftenedQP(tuning, matrix, self.n, self.dt)
+        self._tuning = tuning
+        rates = constraint_matrix(tuning.horizon, self.n)[: 2 * tuning.horizon * self.n].tocsc()
+        self._rates_only = QPSolver(rates, tuning.tolerance, tuning.max_iterations)
+        self._groups = np.repeat(["rate", "rate change"], tuning.horizon * self.n)
+        self._limited: dict[tuple[str, ...], LimitedQP] = {}
+        self.rollout = Rollout(tuning.horizon, self.n)
+
+    def limited(self, kinds: tuple[str, ...]) -> LimitedQP:
+        """Solver for limits of these kinds, made once."""
+        if kinds not in self._limited:
+            self._limited[kinds] = LimitedQP(self._tuning, self.n, self.dt, kinds)
+        return self._limited[kinds]
 
     def reset(self) -> None:
         """Start afresh."""
-        for solver in (self.rates_only, self.complete, self.softened):
+        self._rates_only.reset()
+        for solver in self._limited.values():
             solver.reset()
 
     def require(self, model: LinearModel) -> None:
@@ -260,39 +210,55 @@ class _Workspace:
                 f"{self.n} and {self.dt} s; make a new one"
             )
 
-    def solve(self, qp: QuadraticProgram, warm: np.ndarray | None) -> Solution:
-        """Solve with the rates' rows alone; where that breaks another row, or fails, with all of them.
+    def solve(
+        self,
+        qp: QuadraticProgram,
+        x: np.ndarray,
+        models: Sequence[LinearModel],
+        pose_limits: LinearLimits | None,
+        limits: Limits,
+        warm: np.ndarray | None,
+    ) -> Limited:
+        """Solve with the rates' rows alone; where that breaks another limit, or fails, with all of them.
 
         An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half;
         its multipliers are those of the rates' rows, the others being zero.
         """
-        n_rates, spent = self.rates_only.m, 0
+        n_rates, spent = self._rates_only.m, 0
         try:
-            self.rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
+            self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
             if warm is not None:
-                self.rates_only.warm_start(warm)
-            solution = self.rates_only.solve()
+                self._rates_only.warm_start(warm)
+            solution = self._rates_only.solve()
         except InfeasibleError as error:
             spent = error.details.get("iterations", 0)
         else:
-            rows = self._dense @ solution.x
-            broken = max(float((qp.l - rows).max()), float((rows - qp.u).max()), 0.0)
-            if broken <= self._tolerance:
-                return replace(solution, primal_residual=broken)
+            states = self.rollout(x, models, solution.x)
+            angles = states[1:, 4:]
+            broken = max(float((limits.angle_lower - angles).max()), float((angles - limits.angle_upper).max()), 0.0)
+            if pose_limits is not None:
+                broken = max(broken, float((states[1:] @ pose_limits.C.T + pose_limits.d).max()))
+            if broken <= self._tuning.tolerance * self.dt:
+                return Limited(solution.x, states, {}, active_kinds(solution.y, self._groups), solution)
             spent, warm = solution.iterations, solution.x
-        self.complete.update(qp.P, qp.q, qp.l, qp.u)
-        if warm is not None:
-            self.complete.warm_start(warm)
-        solution = self.complete.solve()
-        return replace(solution, iterations=spent + solution.iterations)
+        kinds = () if pose_limits is None else pose_limits.kinds
+        answer = self.limited(kinds).solve(qp, x, models, pose_limits, soft_angles=False, warm=warm)
+        return replace(answer, solution=_later(answer.solution, spent))
+
+    def soften(
+        self, qp: QuadraticProgram, x: np.ndarray, models: Sequence[LinearModel], pose_limits: LinearLimits | None
+    ) -> Limited:
+        """Solve with the angle limits softened too."""
+        kinds = () if pose_limits is None else pose_limits.kinds
+        return self.limited(kinds).solve(qp, x, models, pose_limits, soft_angles=True)
 
 
 def terminal_weight(model: LinearModel, tuning: Tuning) -> np.ndarray:
     """Cost-to-go of the unconstrained LQR with the tuning's weights, shape (4 + n, 4 + n)."""
-    return _riccati(model, tuning)[1]
+    return riccati(model, tuning)[1]
 
 
-def _riccati(model: LinearModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
+def riccati(model: LinearModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
     """Gain (n, 4 + n) and cost-to-go (4 + n, 4 + n) of the unconstrained LQR."""
     n_states, n = model.B.shape
     # A little weight on the angles keeps the Riccati equation solvable where the tip does not see them all
@@ -303,8 +269,17 @@ def _riccati(model: LinearModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray
     return np.asarray(gain), np.asarray(cost)
 
 
+def lqr_rates(gain: np.ndarray, x: np.ndarray, reference: Reference, dt: float) -> np.ndarray:
+    """Rates of the LQR about where the reference is now, one period before its first state, shape (n,) [rad/s]."""
+    wanted = reference.states[0].copy()
+    wanted[:2] -= dt * wanted[2:4]
+    wanted[4:] -= dt * reference.inputs[0]
+    return np.asarray(reference.inputs[0] - gain @ (x - wanted))
+
+
 def _shifted(inputs: np.ndarray) -> np.ndarray:
     return np.concatenate([inputs[1:], inputs[-1:]])
 
 
-__all__ = ["LinearMPC", "Plan", "Reference", "terminal_weight"]
+def _later(solution: Solution, spent: int) -> Solution:
+    return replace(solution, iterations=spent + solution.iterations)

@@ -43,11 +43,12 @@ class Solution:
 
 
 class QPSolver:
-    """One OSQP workspace for QPs of one size: dense P (upper triangle), constant A.
+    """One OSQP workspace for QPs of one size: dense P (upper triangle), A of one pattern.
 
     Parameters
     ----------
     A : scipy.sparse.csc_matrix, shape (m, n)
+        Indices sorted; zeros that may become something else must be stored.
     tolerance : float
         Absolute and relative.
     max_iterations : int
@@ -70,6 +71,7 @@ class QPSolver:
             "polishing": False,
         }
         self._dense_a = np.ascontiguousarray(A.toarray())
+        self._entries = A.indices * n + np.repeat(np.arange(n), np.diff(A.indptr))  # of the dense one, row by row
         self.reset()
 
     def reset(self) -> None:
@@ -91,7 +93,14 @@ class QPSolver:
         """Start the next solve from x, shape (n,), keeping the last multipliers."""
         self._require(self._osqp.warm_start(self._checked("x", x, self.n), None), "warm_start")
 
-    def update(self, P: np.ndarray, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> None:  # noqa: E741
+    def update(
+        self,
+        P: np.ndarray,
+        q: np.ndarray,
+        l: np.ndarray,  # noqa: E741
+        u: np.ndarray,
+        A: np.ndarray | None = None,
+    ) -> None:
         """Replace the data.
 
         Parameters
@@ -101,6 +110,8 @@ class QPSolver:
         q : ndarray, shape (n,)
         l, u : ndarray, shape (m,)
             Bounds; infinite entries are allowed.
+        A : ndarray, shape (stored entries of A,), optional
+            Column by column, in the order of the first A. None: as they are.
 
         Raises
         ------
@@ -121,7 +132,10 @@ class QPSolver:
                 limit=row,
             )
         core = self._osqp._solver
-        if core.update_data_mat(P_x=P, P_i=None, A_x=None, A_i=None):
+        if A is not None:
+            A = self._checked("A", A, self._matrix.nnz)
+            self._dense_a.ravel()[self._entries] = A
+        if core.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
             # OSQP keeps the refused P, and would say "solved" of a mixture.
             self.reset()
             raise InfeasibleError(

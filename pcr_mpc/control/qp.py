@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
@@ -29,10 +29,13 @@ class Reference:
         Wanted [p, v, q] at the end of each period.
     inputs : ndarray, shape (N, n)
         Feed-forward motor rates in each period [rad/s].
+    forces : ndarray, shape (N, 2), optional
+        That the rods carry at the end of each period [N]; the linear MPC has no use for them.
     """
 
     states: np.ndarray
     inputs: np.ndarray
+    forces: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +49,7 @@ class QuadraticProgram:
     q : ndarray, shape (Nn,)
     A : scipy.sparse.csc_matrix, shape (3 N n, N n)
         Rows: rates, changes of rate, and sums of rates, which are the turned angles over dt: all in rad/s, and the
-        same for every QP.
+        same for every QP (see `constraint_matrix`).
     l, u : ndarray, shape (3 N n,)
         Bounds.
     """
@@ -118,6 +121,46 @@ def build_qp(
     p, q, lower, upper = function.outputs
     return QuadraticProgram(p.copy(), q.copy(), constraint_matrix(tuning.horizon, n),
                             lower.copy(), upper.copy())  # fmt: skip
+
+
+class Rollout:
+    """Predicts the states of a plan: one graph for a whole horizon.
+
+    Parameters
+    ----------
+    horizon, n : int
+        Control periods, motors.
+    """
+
+    def __init__(self, horizon: int, n: int) -> None:
+        self._n_states, self._n = 4 + n, n
+        self._functions = {single: _rollout(horizon, n, single, threading.get_ident()) for single in (True, False)}
+
+    def __call__(self, x: np.ndarray, models: Sequence[LinearModel], inputs: np.ndarray) -> np.ndarray:
+        """States at the ends of the periods, x first, shape (N + 1, 4 + n); one model or N of them."""
+        function = self._functions[len(models) == 1]
+        a, b, c, start, u = function.inputs
+        for k, model in enumerate(models):
+            a[:, k * self._n_states : (k + 1) * self._n_states] = model.A
+            b[:, k * self._n : (k + 1) * self._n] = model.B
+            c[k * self._n_states : (k + 1) * self._n_states] = model.c
+        start[:] = x
+        u.reshape(-1)[:] = inputs.reshape(-1)
+        function()
+        return function.outputs[0].reshape((self._n_states, -1), order="F").T.copy()
+
+
+@lru_cache(maxsize=32)
+def _rollout(horizon: int, n: int, single: bool, thread: int) -> BufferedFunction:
+    n_states, count = 4 + n, 1 if single else horizon
+    a, b = ca.SX.sym("A", n_states, count * n_states), ca.SX.sym("B", n_states, count * n)
+    c, x, u = ca.SX.sym("c", count * n_states), ca.SX.sym("x", n_states), ca.SX.sym("u", horizon * n)
+    states = [x]
+    for k in range(horizon):
+        i = 0 if single else k
+        rows, columns = slice(i * n_states, (i + 1) * n_states), slice(i * n, (i + 1) * n)
+        states.append(a[:, rows] @ states[-1] + b[:, columns] @ u[k * n : (k + 1) * n] + c[rows])
+    return BufferedFunction(ca.Function("rollout", [a, b, c, x, u], [ca.vertcat(*states)]))
 
 
 @lru_cache(maxsize=16)

@@ -13,6 +13,7 @@ from .observer import ObserverTuning
 
 METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 SCHEMES = ("rk4", "rk8")
+LAWS = ("linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward")
 LINEARISE = ("here", "along_plan")
 FALLBACKS = ("ladder", "raise")
 
@@ -41,7 +42,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Tuning:
-    """Tuning of the linear MPC.
+    """Tuning of a controller; what its law has no use for is ignored.
 
     Attributes
     ----------
@@ -61,6 +62,11 @@ class Tuning:
     model : Model
     observer : ObserverTuning or None
         None: the measured state is taken as it is, and no force is suspected.
+    law : {"linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward"}
+    pd : (float, float)
+        Gains on the tip's error and on its rate [1], [s].
+    period : float or None
+        Control period for which it was tuned [s]. None: the scene's.
     """
 
     name: str
@@ -74,11 +80,16 @@ class Tuning:
     fallback: str
     model: Model
     observer: ObserverTuning | None = None
+    law: str = LAWS[0]
+    pd: tuple[float, float] = (0.0, 0.0)
+    period: float | None = None
 
     def __post_init__(self) -> None:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+        if self.law not in LAWS:
+            raise ValueError(f"law is {self.law!r}, expected one of {', '.join(LAWS)}")
         for name in ("position_weight", "input_weight", "tolerance"):
             checked_number(name, getattr(self, name), above=0.0)
         for name in ("velocity_weight", "angle_weight"):
@@ -114,6 +125,20 @@ class Limits:
         if lower.ndim != 1 or lower.shape != upper.shape or not (lower <= upper).all():
             raise ValueError(f"angle_lower = {lower} and angle_upper = {upper} must be vectors, lower <= upper")
 
+    def clipped(self, u: np.ndarray, u_previous: np.ndarray) -> np.ndarray:
+        """Rates nearest to u that meet the limits on rate and change exactly; OSQP meets them to its tolerance."""
+        within = np.minimum(np.maximum(u, u_previous - self.rate_change), u_previous + self.rate_change)
+        return np.asarray(np.minimum(np.maximum(within, -self.rate), self.rate))
+
+    def within_stops(self, u: np.ndarray, q: np.ndarray, dt: float) -> np.ndarray:
+        """Rates nearest to u that keep the angles within their limits for one period."""
+        return np.asarray(np.minimum(np.maximum(u, (self.angle_lower - q) / dt), (self.angle_upper - q) / dt))
+
+    def met_by(self, u: np.ndarray, u_previous: np.ndarray) -> tuple[str, ...]:
+        """Which limits the clipped rates u meet: on the rate, on its change, or else on an angle."""
+        met = {"rate": np.abs(u) >= self.rate, "rate change": np.abs(u - u_previous) >= self.rate_change - 1e-12}
+        return tuple(kind for kind, where in met.items() if where.any()) or ("angle",)
+
 
 def load_tuning(path: str | Path) -> Tuning:
     """Read a controller tuning from TOML (see ``controllers/default.toml``).
@@ -125,7 +150,8 @@ def load_tuning(path: str | Path) -> Tuning:
     """
     with (
         read_toml(path) as file,
-        file.table("weights") as weights,
+        file.table("weights", {}) as weights,
+        file.table("pd", {}) as pd,
         file.table("solver", {}) as solver,
         file.table("model", {}) as model,
         file.table("observer", {}) as observer,
@@ -136,13 +162,20 @@ def load_tuning(path: str | Path) -> Tuning:
             force_noise=observer.number("force_noise", ObserverTuning.force_noise, above=0.0),
             force_walk=observer.number("force_walk", ObserverTuning.force_walk, above=0.0),
         )
+        law = file.text("law", LAWS[0], choices=LAWS)
+        predicts, weighs = law.endswith("mpc"), law.endswith("mpc") or law == "lqr"
+        gains = (pd.number("position"), pd.number("velocity", 0.0)) if law == "pd" else (0.0, 0.0)
+        period = file.number("period", 0.0, minimum=0.0)
         return Tuning(
             name=file.text("name"),
-            horizon=file.integer("horizon"),
-            position_weight=weights.number("position", above=0.0),
+            law=law,
+            period=period or None,
+            pd=gains,
+            horizon=file.integer("horizon") if predicts else 1,
+            position_weight=weights.number("position", above=0.0) if weighs else 1.0,
             velocity_weight=weights.number("velocity", 0.0, minimum=0.0),
             angle_weight=weights.number("angle", 0.0, minimum=0.0),
-            input_weight=weights.number("input", above=0.0),
+            input_weight=weights.number("input", above=0.0) if weighs else 1.0,
             tolerance=solver.number("tolerance", 1e-5, above=0.0),
             max_iterations=solver.integer("max_iterations", 4000),
             fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),

@@ -11,14 +11,12 @@ import numpy as np
 
 from ..buffered import BufferedFunction
 from ..errors import checked_number, checked_vector
-from ..plant.dynamics import Plant
+from ..plant.dynamics import DERIVATIVE_ACCURACY, Plant
 from .linear_model import LinearModel
 
 # Taylor order and squarings of the matrix exponential: better than 1e-9 up to K dt^2/m and (c dt/m)^2 of 1000.
 _TAYLOR_ORDER, _SQUARINGS = 8, 6
 _STIFFEST = 1e3
-# Residual of the statics at which K and G may be taken; their error is of this size.
-DERIVATIVE_ACCURACY = 1e-6
 
 
 def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) -> LinearModel:
@@ -71,7 +69,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     a, b, c, e = (output.copy() for output in function.outputs)
     if not np.isfinite(c).all():
         raise ValueError(f"the linear model at x = {x} with external force {f_ext} N is not finite")
-    return LinearModel(a, b, c, e, dt)
+    return LinearModel(a, b, c, e, dt, f_ext.copy())
 
 
 @lru_cache(maxsize=32)

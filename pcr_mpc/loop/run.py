@@ -49,10 +49,14 @@ class Run:
         Commanded motor rates [rad/s].
     plant_time : ndarray, shape (K,)
         Wall time of each plant step [s].
-    control_time : ndarray, shape (M, 4)
-        Wall time of each control step: total, linearisation, QP update, QP solution [s].
+    control_time : ndarray, shape (M, 5)
+        Wall time of each control step: total, linearisation, QP update, QP solution; CPU time of its thread [s].
     iterations : ndarray, shape (M,)
-        Of OSQP.
+        Of the solver.
+    active_limits : dict
+        In how many control periods each kind of limit shaped the plan.
+    slack : dict
+        By how much each kind of limit had to give at most, in its own unit (see `Plan`).
     rungs : dict
         How many poses of the plant each rung of the statics' ladder has solved (see `RodSolver`).
     events : list of dict
@@ -72,6 +76,8 @@ class Run:
     plant_time: np.ndarray
     control_time: np.ndarray
     iterations: np.ndarray
+    active_limits: dict[str, int]
+    slack: dict[str, float]
     rungs: dict[str, int]
     events: list[dict[str, Any]] = field(default_factory=list)
 
@@ -106,7 +112,7 @@ class Run:
     def peak_torque(self) -> float:
         """Largest torque that a motor had to supply, by the exact rods at the control periods [N m].
 
-        The robot's torque limit is not enforced; this is what to hold against it.
+        The MPC keeps the robot's torque limit where it can; this is what to hold against it.
         """
         plant = Plant(self.scene.robot, method="closed_form", dt=self.dt)
         plant.reset(self.x[0], self.pose)
@@ -140,6 +146,7 @@ class Run:
             "final_tip_m": self.x[-1, :2].tolist(),
             "plant_step_us": percentiles(1e6 * self.plant_time),
             "control_step_us": percentiles(1e6 * self.control_time[:, 0]),
+            "control_cpu_us": percentiles(1e6 * self.control_time[:, 4]),
             "control_parts_us": {
                 name: percentiles(1e6 * self.control_time[:, 1 + i])
                 for i, name in enumerate(("linearise", "update", "solve"))
@@ -154,6 +161,9 @@ class Run:
             "torque_limit_Nm": self.scene.robot.torque_limit,
             "statics_rungs": self.rungs,
             "limit_violations": self.limit_violations(),
+            "control_steps": len(self.u),
+            "active_limits": self.active_limits,
+            "slack": self.slack,
             "fallbacks": kinds.count("fallback"),
             "control_rungs": {"solved": len(self.u) - kinds.count("fallback"), **rungs},
             "deadline_misses": kinds.count("late"),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError
+from ..linearisation.pose_limits import PoseLimits
 from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import forward_statics, inverse_statics
@@ -22,6 +23,8 @@ from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 LATE = ("hold", "shifted_plan")
 # Distance of the start from the reference that is taken for the same place [m].
 _START_TOLERANCE = 1e-3
+# Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
+_LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 0.5
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,8 @@ class Scene:
         reaches the motors as late as it is. Infinite: lateness is not simulated.
     late : {"hold", "shifted_plan"}
         What the motors do until a late decision arrives: go on as before, or as the last plan foresaw.
+    pose_limits : PoseLimits
+        Torque, tip region and stability margins, which a controller keeps if it can.
     """
 
     name: str
@@ -94,11 +99,30 @@ class Scene:
     delay: int = 0
     deadline: float = math.inf
     late: str = LATE[0]
+    pose_limits: PoseLimits = field(default_factory=PoseLimits)
 
     @property
     def n_periods(self) -> int:
         """Control periods in the run."""
         return round(self.duration / self.period)
+
+    def tuned(self, tuning: Tuning) -> Scene:
+        """Return the scene with another tuning, and with the control period that it asks for.
+
+        Raises
+        ------
+        ModelError
+            That period is not a multiple of the plant's step.
+        """
+        period = tuning.period or self.period
+        ratio = period / self.plant.dt
+        if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio or self.duration < period:
+            raise ModelError(
+                f"{tuning.name}: period {period} s does not fit scene {self.name}: it must be a multiple of the "
+                f"plant's step {self.plant.dt} s and at most the duration {self.duration} s",
+                key="period",
+            )
+        return replace(self, tuning=tuning, period=period)
 
     def start(self) -> Equilibrium:
         """Solve for the pose in which the robot starts, in balance without load.
@@ -153,7 +177,9 @@ def load_scene(path: str | Path) -> Scene:
                 robot,
                 rate_limit=limits.number("rate", robot.rate_limit, above=0.0),
                 acceleration_limit=limits.number("acceleration", robot.acceleration_limit, above=0.0),
+                torque_limit=limits.number("torque", robot.torque_limit, above=0.0),
             )
+            pose_limits = _pose_limits(limits, robot)
         with file.table("start") as start:
             tip = start.vector("tip", 2, None)
             motors = start.vector("motors", robot.n_rods, None)
@@ -190,7 +216,7 @@ def load_scene(path: str | Path) -> Scene:
             trajectory = _trajectory(reference)
     scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                   tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
-                  delay, deadline, late)  # fmt: skip
+                  delay, deadline, late, pose_limits)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",
@@ -205,7 +231,24 @@ def load_scene(path: str | Path) -> Scene:
                 file=str(path),
                 key="start.tip",
             )
-    return scene
+    return scene if scene.tuning is None else scene.tuned(scene.tuning)
+
+
+def _pose_limits(table: Table, robot: Robot) -> PoseLimits:
+    """Stability margins have defaults, for nobody wants a snap by surprise; 0 switches one off."""
+    corners = [table.vector(key, 2, None) for key in ("tip_lower", "tip_upper")]
+    if (corners[0] is None) != (corners[1] is None):
+        raise table.fail("tip_lower", "give both tip_lower and tip_upper, or neither")
+    if corners[0] is not None and not all(low < high for low, high in zip(*corners, strict=True)):
+        raise table.fail("tip_lower", f"{corners[0]} is not below tip_upper {corners[1]}")
+    softness = _LEAST_STIFFNESS * float((robot.stiffnesses / robot.lengths**3).sum())
+    return PoseLimits(
+        robot.torque_limit,
+        corners[0],
+        corners[1],
+        table.number("rod_margin", _LEAST_ROD_MARGIN, minimum=0.0, maximum=0.9) or None,
+        table.number("stiffness", softness, minimum=0.0) or None,
+    )
 
 
 def _trajectory(table: Table) -> Trajectory | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
@@ -68,8 +68,10 @@ def simulate(
     states = np.empty((n_periods * per + 1, len(x)))
     inputs = np.empty((n_periods, n))
     plant_time = np.empty(n_periods * per)
-    control_time = np.zeros((n_periods, 4))
+    control_time = np.zeros((n_periods, 5))
     iterations = np.zeros(n_periods, dtype=int)
+    active: Counter[str] = Counter()
+    slack: dict[str, float] = {}
     events: list[dict[str, Any]] = []
     states[0] = x
     done, decided, snapped = 0, 0, 0
@@ -92,6 +94,8 @@ def simulate(
             plant_time=plant_time[:done].copy(),
             control_time=control_time[:decided].copy(),
             iterations=iterations[:decided].copy(),
+            active_limits=dict(active),
+            slack=slack,
             rungs=plant.rungs,
             events=events,
         )
@@ -103,9 +107,10 @@ def simulate(
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
             if scene.angle_step:
                 measured[4:] = scene.angle_step * np.round(measured[4:] / scene.angle_step)
-            began = time.perf_counter()
+            began, began_cpu = time.perf_counter(), time.thread_time()
             decision = controller.step(k, measured)
             control_time[k, 0] = time.perf_counter() - began
+            control_time[k, 4] = time.thread_time() - began_cpu
             inputs[k] = decision.u
             decided = k + 1
             on_the_way.append(decision.u)
@@ -119,8 +124,10 @@ def simulate(
                 )
             if decision.plan is not None:
                 plan = decision.plan
-                control_time[k, 1:] = decision.linearise_time, plan.update_time, plan.solve_time
+                control_time[k, 1:4] = decision.linearise_time, plan.update_time, plan.solve_time
                 iterations[k] = plan.iterations
+                active.update(plan.active)
+                slack |= {kind: max(amount, slack.get(kind, 0.0)) for kind, amount in plan.slack.items()}
                 if plan.fallback:
                     events.append(
                         {

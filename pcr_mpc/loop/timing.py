@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ..linearisation.linearise import DERIVATIVE_ACCURACY
-from ..plant.dynamics import Plant
+from ..plant.dynamics import DERIVATIVE_ACCURACY, Plant
 from ..plant.statics import METHODS
-from .controllers import make_controller
 from .run import Run, percentiles
 from .scene import Scene
 from .simulate import simulate
+from .tracking import make_controller
 
 _WARM_UP = 20
 # One SciPy solve takes milliseconds: fewer of them say as much.

@@ -58,9 +58,8 @@ class HeldShape:
 
     def stable(self) -> bool:
         """Whether the load is below lambda_c."""
-        table = _chart()
         # Far below the tabulated limit there is no need to find it exactly.
-        near = 0.7 * float(np.interp(self.log_tip_angle, table.rows, table.limits))
+        near = 0.7 * rough_critical_load(self.log_tip_angle)
         return self.load < near or self.load < critical_load(self.log_tip_angle)
 
     def polished(self, xi: float, eta: float) -> HeldShape | None:
@@ -129,7 +128,7 @@ def critical_load(log_tip_angle: float) -> float:
     """lambda_c, the load at which a rod with its tip held loses stability."""
 
     def determinant(load: float) -> float:
-        return float(np.linalg.det(_evaluate_tip(np.array([log_tip_angle, load]), np.zeros(2))[1]))
+        return _determinant(log_tip_angle, load)
 
     if log_tip_angle < _LOOPED:
         # A full loop is about to leave a taut rod, a little short of 2 K(k).
@@ -137,14 +136,26 @@ def critical_load(log_tip_angle: float) -> float:
         if log_tip_angle < _VANISHES:
             return float(full_loop - 0.55)
         return float(brentq(determinant, full_loop - 0.8, full_loop - 0.3, xtol=1e-10))
-    chart = _chart()
-    guess = float(np.interp(log_tip_angle, chart.rows, chart.limits))
+    guess = rough_critical_load(log_tip_angle)
     # The table is good to a few per cent at most (where lambda_c jumps, between two of its rows).
     for width in (0.02, 0.1, 0.4):
         low, high = guess * (1 - width), guess * (1 + width)
         if determinant(low) * determinant(high) < 0:
             return float(brentq(determinant, low, high, xtol=1e-10))
     return guess
+
+
+def critical_load_slope(log_tip_angle: float, critical: float) -> float:
+    """D lambda_c / d log tip_angle: the zero of the determinant moves so that it stays one."""
+    h = 1e-4
+    by_angle = _determinant(log_tip_angle + h, critical) - _determinant(log_tip_angle - h, critical)
+    return -by_angle / (_determinant(log_tip_angle, critical + h) - _determinant(log_tip_angle, critical - h))
+
+
+def rough_critical_load(log_tip_angle: float) -> float:
+    """lambda_c from the chart, good to a few per cent; at once."""
+    chart = _chart()
+    return float(np.interp(log_tip_angle, chart.rows, chart.limits))
 
 
 def held_shapes(xi: float, eta: float) -> list[HeldShape]:
@@ -180,6 +191,10 @@ def _evaluate_tip(unknowns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray,
     function()
     tip, jacobian, energy = function.outputs
     return tip - target, jacobian.copy(), float(energy[0])
+
+
+def _determinant(log_tip_angle: float, load: float) -> float:
+    return float(np.linalg.det(_evaluate_tip(np.array([log_tip_angle, load]), np.zeros(2))[1]))
 
 
 @lru_cache

@@ -10,12 +10,15 @@ import numpy as np
 from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
 from .equilibrium import Equilibrium
 from .robot import Robot
-from .rod_solver import Snap
+from .rod_solver import RodSolver, Snap
+from .rod_state import RobotState
 from .statics import checked_shooting, make_solver
 
 ON_SNAP = ("raise", "jump")
 # A simulation uses the derivatives only to predict the next pose.
 _PREDICTOR_ACCURACY = 1e-2
+# Residual of the statics at which derivatives may be taken for a linear model; their error is of this size.
+DERIVATIVE_ACCURACY = 1e-6
 # Relative drift of a rod's invariant beyond which its force may be off by per cents.
 _LARGEST_DRIFT = 1e-3
 
@@ -75,6 +78,7 @@ class Plant:
         self._advance = INTEGRATORS[integrator]
         self._solver = make_solver(robot, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
         self._at: tuple[float, ...] | None = None
+        self._accuracy = 0.0  # of the derivatives there
         self._lower, self._upper = robot.angle_limits.T.copy()
 
     def reset(self, x: Any, guess: Equilibrium | None = None) -> None:
@@ -147,21 +151,29 @@ class Plant:
 
         ``accuracy`` bounds the residual of the iterate at which K and G were taken; None: at the solution.
         """
-        self._at = None  # the last solve may have been content with rougher derivatives
         self._go(p, q, accuracy)
         k, g = self._solver.jacobians()
         return self._solver.force(), k, g
 
+    def rods(self, p: np.ndarray, q: np.ndarray) -> RobotState:
+        """Unknowns, loads and derivatives of all rods at (p, q), following the branch; not for single shooting.
+
+        Valid until the plant moves on.
+        """
+        if not isinstance(self._solver, RodSolver):
+            raise ValueError(f"method {self.method} keeps no unknowns of the rods")
+        self._go(p, q, DERIVATIVE_ACCURACY)
+        return self._solver.state
+
     def equilibrium(self, x: Any) -> Equilibrium:
         """Everything about the rods at state x, following the branch."""
         x = checked_vector("x", x, self.n_states)
-        self._at = None
         self._go(x[:2], x[4:], None)
         return self._solver.equilibrium(x[:2], x[4:])
 
     def _go(self, p: np.ndarray, q: np.ndarray, derivatives: float | None) -> None:
-        at = (*p.tolist(), *q.tolist())
-        if at == self._at:
+        at, accuracy = (*p.tolist(), *q.tolist()), derivatives or 0.0
+        if at == self._at and self._accuracy <= accuracy:
             return
         self._at = None
         try:
@@ -187,7 +199,7 @@ class Plant:
                 "slow down or keep away from this pose",
                 rod=unstable[0],
             )
-        self._at = at
+        self._at, self._accuracy = at, accuracy
 
     def _acceleration(self, p: np.ndarray, v: np.ndarray, q: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         return np.asarray((f_ext - self.force(p, q) - self.robot.drag * v) / self.robot.tip_mass)

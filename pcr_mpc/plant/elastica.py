@@ -119,6 +119,22 @@ def rod_newton() -> tuple[Any, Any]:
 
 
 @lru_cache
+def rod_curvature() -> Any:
+    """Graph (unknowns (3), pose (3)) -> third derivatives of the energy that hold a tip coordinate twice.
+
+    Shape (4, 3): column j is the derivative of [d n_x/dx, d n_y/dx, d n_x/dy, d n_y/dy] by pose j, along the branch.
+    """
+    unknowns, pose = ca.SX.sym("unknowns", 3), ca.SX.sym("pose", 3)
+    newton, _ = rod_newton()
+    _, moves, _, load_moves, _ = newton(unknowns, pose)
+    stiffness = ca.vec(load_moves[:2, :2])
+    directions = ca.vertcat(moves, ca.SX.eye(3))
+    both = ca.vertcat(unknowns, pose)
+    columns = ca.jtimes(stiffness, both, directions)
+    return ca.Function("rod_curvature", [unknowns, pose], [columns], {"cse": True})
+
+
+@lru_cache
 def _pendulums(count: int) -> Any:
     log_tip_angle, u = ca.SX.sym("log_tip_angle"), ca.SX.sym("u")
     return ca.Function("pendulum", [log_tip_angle, u], list(pendulum(log_tip_angle, u)[:2])).map(count)

@@ -118,7 +118,7 @@ class RodSolver:
         ConvergenceError
             Neither Newton's method nor continuation got there.
         """
-        state = self._started()
+        state = self.state
         if self._move_warm(state, p, q, derivatives):
             self.rungs["warm"] += 1
             return
@@ -189,28 +189,28 @@ class RodSolver:
 
     def force(self) -> np.ndarray:
         """F = sum n_i = dU/dp at the last pose, shape (2,) [N]."""
-        return self._started().force
+        return self.state.force
 
     def energy(self) -> float:
         """U at the last pose [J]."""
-        return float(self._started().scalars[2] @ self._moment_units)
+        return float(self.state.scalars[2] @ self._moment_units)
 
     def unstable_rods(self) -> tuple[int, ...]:
         """Rods with a conjugate point at the last pose."""
-        return self._started().unstable_rods
+        return self.state.unstable_rods
 
     def drift(self) -> float:
         """Change of the invariant m^2/2 + n . t along the rods, over its size, added up."""
-        return self._started().drift
+        return self.state.drift
 
     def jacobians(self) -> tuple[np.ndarray, np.ndarray]:
         """K (2, 2) [N/m] and G (2, n) [N/rad] at the last pose, by implicit differentiation."""
-        state = self._started()
+        state = self.state
         return state.k, state.g
 
     def equilibrium(self, p: np.ndarray, q: np.ndarray) -> Equilibrium:
         """Everything about the last pose, which was solved at (p, q)."""
-        state = self._started()
+        state = self.state
         k, g = self.jacobians()
         # Nodes at most 4 / lambda apart, so that integrating between them is stable on taut rods.
         load = math.sqrt(float(np.hypot(*state.loads[:2]).max()))
@@ -239,7 +239,9 @@ class RodSolver:
             unstable_rods=self.unstable_rods(),
         )
 
-    def _started(self) -> RobotState:
+    @property
+    def state(self) -> RobotState:
+        """Last pose."""
         if self._state is None:
             raise RuntimeError("no pose to start from: call start (or Plant.reset) first")
         return self._state

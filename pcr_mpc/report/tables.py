@@ -38,17 +38,24 @@ def summary_table(summary: dict[str, Any]) -> str:
     times = [("plant step", summary["plant_step_us"], summary["plant_budget_us"])]
     if summary["control_step_us"]["p50"] is not None:
         times.append(("control step", summary["control_step_us"], summary["control_budget_us"]))
+        times.append(("  its CPU time", summary["control_cpu_us"], None))
         times += [(f"  {name}", values, None) for name, values in summary["control_parts_us"].items()]
     lines += [times_table(times), ""]
     iterations = summary["qp_iterations"]
     lines += [
         f"QP iterations     p50 {iterations['p50']}, max {iterations['max']}",
-        f"peak torque       {summary['peak_torque_Nm']:.3f} N m (limit {summary['torque_limit_Nm']:g}, not enforced)",
+        f"peak torque       {summary['peak_torque_Nm']:.3f} N m (limit {summary['torque_limit_Nm']:g}, soft)",
+        f"limits active in  {_counts(summary['active_limits'])} of {summary['control_steps']} periods",
+        f"largest slack     {', '.join(f'{k} {v:.3g}' for k, v in summary['slack'].items()) or 'none'}",
         f"limit violations  {summary['limit_violations']}",
         f"fall-backs        {summary['fallbacks']}",
         f"failures          {summary['failures']}",
     ]
     return "\n".join(lines)
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "0"
 
 
 def times_table(rows: Sequence[tuple[str, dict[str, Any], float | None]]) -> str:

@@ -1,0 +1,59 @@
+"""What a controller answers, and how it came about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..frozen import freeze
+from ..linearisation.linear_model import LinearModel
+
+# From the best answer to the last resort.
+RUNGS = ("softened", "shifted_plan", "lqr", "hold")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Result of one control step: the motor rates, and the certificate that goes with them.
+
+    Attributes
+    ----------
+    inputs : ndarray, shape (N, n)
+        Motor rates; the first row is to be applied [rad/s].
+    states : ndarray, shape (N + 1, 4 + n), or None
+        Predicted states, the current one first; None where nothing predicts.
+    models : LinearModel or sequence of N, or None
+        What they were predicted with.
+    status : str
+        "solved", or what went wrong.
+    fallback : {None, "softened", "shifted_plan", "lqr", "hold"}
+        Rung of the ladder that answered instead (see `LinearMPC`).
+    active : tuple of str
+        Kinds of limits that shape the plan: "rate", "rate change", "angle" and the kinds of `LinearLimits`.
+    slack : dict
+        By how much limits had to give, by kind, in their own units ([rad], [N m], [m], 1, [N/m]); only those that did.
+    iterations : int
+        Of the solver.
+    primal_residual, dual_residual : float
+        Recomputed from the problem's data; NaN if unsolved.
+    update_time, solve_time : float
+        Assembling the problem, and handing it over and solving it [s].
+    """
+
+    inputs: np.ndarray
+    states: np.ndarray | None
+    models: LinearModel | Sequence[LinearModel] | None
+    status: str
+    fallback: str | None = None
+    active: tuple[str, ...] = ()
+    slack: dict[str, float] = field(default_factory=dict)
+    iterations: int = 0
+    primal_residual: float = float("nan")
+    dual_residual: float = float("nan")
+    update_time: float = 0.0
+    solve_time: float = 0.0
+
+    def __post_init__(self) -> None:
+        freeze(self)

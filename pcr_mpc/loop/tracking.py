@@ -1,0 +1,189 @@
+"""The controller of a scene: estimate, linearise, decide by a control law, and say how."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+import numpy as np
+
+from ..control.laws import LQR, PD, FeedForward, Law
+from ..control.mpc import LinearMPC
+from ..control.observer import DisturbanceObserver
+from ..control.plan import Plan
+from ..control.qp import Reference
+from ..control.tuning import Limits, Tuning
+from ..errors import PCRError
+from ..linearisation.linear_limits import LinearLimits
+from ..linearisation.linear_model import LinearModel
+from ..linearisation.linearise import linearise
+from ..linearisation.pose_limits import LimitWatch
+from ..plant.dynamics import Plant
+from ..plant.equilibrium import Equilibrium
+from ..plant.robot import Robot
+from .along_plan import AlongPlan
+from .controllers import Controller, Decision, HoldMotors
+from .feed_forward import feed_forward
+from .scene import Scene
+from .target import MotorTarget
+
+
+class TrackingController:
+    """A control law behind an observer, a prediction of delays and a target that carries the unknown force.
+
+    Parameters
+    ----------
+    scene : Scene
+        Reference, period, delay, sensors and limits; not its loads.
+    tuning : Tuning
+    robot : Robot, optional
+        What the controller believes the robot to be; by default the scene's.
+    """
+
+    def __init__(self, scene: Scene, tuning: Tuning, robot: Robot | None = None) -> None:
+        if scene.trajectory is None:
+            raise ValueError(f"scene {scene.name} has no reference to track")
+        self.name = tuning.name
+        self.robot = robot or scene.robot
+        self.observer: DisturbanceObserver | None = None
+        self._scene, self._tuning = scene, tuning
+        self._delay = scene.delay if tuning.model.predict_delay else 0
+        self._model = self._make_model()
+        self._along: AlongPlan | None = None
+        if tuning.model.linearise == "along_plan":
+            self._along = AlongPlan([self._make_model() for _ in range(tuning.horizon - 1)], scene.period)
+        self._watch = LimitWatch(scene.pose_limits, self._model)
+        self._target = MotorTarget(self.robot)
+        self._on_the_way: deque[np.ndarray] = deque()
+        self._u = np.zeros(self.robot.n_rods)
+        self._plan: Plan | None = None
+        self._law = self._make_law(motor_limits(scene.robot, scene.period))
+
+    def start(self, pose: Equilibrium) -> None:
+        """See `Controller`; solves the inverse dynamics of the whole reference."""
+        self._reference = feed_forward(self._scene, self.robot, pose, self._tuning.horizon + self._delay)
+        x = np.concatenate([pose.p, np.zeros(2), pose.q])
+        model = self._make_model()
+        model.reset(x, pose)
+        resting = linearise(model, x, np.zeros(self.robot.n_rods), self._scene.period)
+        # One throw-away step pays for building graphs and workspaces before the clock runs.
+        self._restart(x, pose, resting)
+        self.step(0, x)
+        self._restart(x, pose, resting)
+
+    def _restart(self, x: np.ndarray, pose: Equilibrium, resting: LinearModel) -> None:
+        """Forget everything: the robot rests in ``pose``, about which ``resting`` is the linear model."""
+        self._law.reset()
+        self._law.prepare(resting, self._watch.kinds)
+        if self._tuning.observer is not None:
+            sensors = self._scene.tip_noise, self._scene.angle_step
+            self.observer = DisturbanceObserver(self._tuning.observer, *sensors, resting)
+            self.observer.start(x)
+        for part in (self._model, self._watch, self._along):
+            if part is not None:
+                part.reset(x, pose)
+        self._target.start(pose)
+        self._inverse.start(pose)
+        self._predicts = resting
+        self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
+        self._u = np.zeros(self.robot.n_rods)
+        self._plan = None
+
+    def step(self, k: int, x: np.ndarray) -> Decision:
+        """See `Controller`; a measurement that is not finite is bridged by the prediction."""
+        period, observer = self._scene.period, self.observer
+        force = np.zeros(2)
+        if observer is not None:
+            if np.isfinite(x[:2]).all() and np.isfinite(x[4:]).all():
+                observer.correct(x[:2], x[4:])
+            x, force = observer.x, observer.force
+        began = time.perf_counter()
+        failure, now, ahead = "", None, x
+        models: LinearModel | list[LinearModel] | None = None
+        pose_limits: LinearLimits | None = None
+        try:
+            for u in self._on_the_way:
+                model = linearise(self._model, ahead, u, period, force)
+                now = now or model
+                ahead = model(ahead, u)
+            models = self._linearise(ahead, k, force)
+            pose_limits = self._watch.rows(ahead)
+        except (PCRError, ValueError) as error:
+            if self._tuning.fallback == "raise":
+                raise
+            failure, models = f"no linear model: {error}", None
+        linearised = time.perf_counter() - began
+        window = self._window(k + self._delay, force)
+        if models is None:
+            plan = self._law.fall_back(failure, ahead, window, self._u)
+        else:
+            plan = self._law.solve(ahead, models, window, self._u, pose_limits)
+        self._u, self._plan = plan.inputs[0], plan
+        self._on_the_way.append(self._u)
+        arriving = self._on_the_way.popleft()
+        if models is not None:
+            self._predicts = now or (models if isinstance(models, LinearModel) else models[0])
+        if observer is not None:
+            observer.predict(self._predicts, arriving)
+        return Decision(plan.inputs[0], plan, linearised)
+
+    def _linearise(self, x: np.ndarray, k: int, force: np.ndarray) -> LinearModel | list[LinearModel]:
+        here = linearise(self._model, x, self._u, self._scene.period, force)
+        if self._along is None:
+            return here
+        # The last plan, one period on; at the start the reference.
+        if self._plan is None or self._plan.states is None:
+            first = k + self._delay + 1
+            path = self._reference.states[first : first + self._tuning.horizon - 1]
+        else:
+            path = self._plan.states[2:]
+        return [here, *self._along.models(path, self._u, force)]
+
+    def _window(self, k: int, force: np.ndarray) -> Reference:
+        """Reference over the horizon from period k on, its angles moved to carry the unknown force."""
+        horizon, reference = self._tuning.horizon, self._reference
+        states, inputs = reference.states[k + 1 : k + 1 + horizon], reference.inputs[k : k + horizon]
+        forces = reference.forces[k + 1 : k + 1 + horizon]
+        if self.observer is not None:
+            end = states[-1]
+            forces = forces + force
+            states = states.copy()
+            states[:, 4:] += self._target.shift(end[:2], end[4:], forces[-1])
+        return Reference(states, inputs, forces)
+
+    def _make_model(self) -> Plant:
+        model = self._tuning.model
+        return Plant(self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme)
+
+    def _make_law(self, limits: Limits) -> Law:
+        law = self._tuning.law
+        self._inverse = MotorTarget(self.robot)
+        if law == "pd":
+            return PD(self._tuning, limits, lambda p, q, force: q + self._inverse.shift(p, q, force))
+        if law == "lqr":
+            return LQR(self._tuning, limits)
+        if law == "feed_forward":
+            return FeedForward(self._tuning, limits)
+        return LinearMPC(self._tuning, limits)
+
+
+def motor_limits(robot: Robot, period: float) -> Limits:
+    """Limits of the robot's motors as the controller needs them."""
+    lower, upper = robot.angle_limits.T
+    return Limits(robot.rate_limit, robot.acceleration_limit * period, lower.copy(), upper.copy())
+
+
+def make_controller(scene: Scene, tuning: Tuning | None = None, robot: Robot | None = None) -> Controller:
+    """Build the controller of a scene: that of its tuning, or none where there is nothing to track.
+
+    Parameters
+    ----------
+    tuning : Tuning, optional
+        Instead of the scene's own.
+    robot : Robot, optional
+        What the controller believes the robot to be.
+    """
+    tuning = tuning or scene.tuning
+    if scene.trajectory is None or tuning is None:
+        return HoldMotors(scene.robot.n_rods)
+    return TrackingController(scene, tuning, robot)
