@@ -21,7 +21,7 @@ class Law(Protocol):
     def reset(self) -> None:
         """Start afresh."""
 
-    def prepare(self, model: LinearModel, kinds: tuple[str, ...] = ()) -> None:
+    def prepare(self, model: LinearModel, combinations: Sequence[tuple[str, ...]] = ()) -> None:
         """Get ready for a robot that rests where ``model`` was made."""
 
     def solve(
@@ -48,7 +48,7 @@ class _OneStep:
     def reset(self) -> None:
         """See `Law`."""
 
-    def prepare(self, model: LinearModel, kinds: tuple[str, ...] = ()) -> None:
+    def prepare(self, model: LinearModel, combinations: Sequence[tuple[str, ...]] = ()) -> None:
         """See `Law`."""
         self._dt = model.dt
 
@@ -89,7 +89,7 @@ class FeedForward(_OneStep):
 class LQR(_OneStep):
     """Feed-forward and the steady gain of `control.dlqr` about the start."""
 
-    def prepare(self, model: LinearModel, kinds: tuple[str, ...] = ()) -> None:
+    def prepare(self, model: LinearModel, combinations: Sequence[tuple[str, ...]] = ()) -> None:
         """See `Law`."""
         super().prepare(model)
         self._gain, _ = riccati(model, self.tuning)

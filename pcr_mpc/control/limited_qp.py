@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg.blas import dtrsm, dtrsv
+from scipy.linalg.lapack import dpotrf
 
+from ..errors import InfeasibleError
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .osqp_solver import QPSolver, Solution
 from .qp import QuadraticProgram, constraint_matrix
 from .tuning import Tuning
 
-# An exact penalty: more than any multiplier of the hard problem, per m^2 of position weight, for one radian of an angle
-# or one unit of a row of `LinearLimits`.
-_PENALTY = 0.3
-_CURVATURE = 1e-6  # of a slack's cost, relative to the penalty: the QP stays strictly convex
+# Price of a limit that gives way, per square root of the position weight. The penalty is exact while it exceeds every
+# multiplier, and those are what a limit costs in the root of the tracking cost: 0.2 is a detour of 20 cm for a period.
+_PENALTY = 0.2
+_TOLERANCE = 10.0  # times the tuning's: the rows are scaled, and the inputs still right to 0.01 rad/s
 _SLACK_SEEN = 1e-4  # rad or units of a row: less is the solver's tolerance
 
 
@@ -36,7 +38,7 @@ class Limited:
     active : tuple of str
         Kinds of limits with a multiplier.
     solution : Solution
-        Of the extended QP.
+        Of the QP that was solved.
     """
 
     inputs: np.ndarray
@@ -47,19 +49,17 @@ class Limited:
 
 
 class LimitedQP:
-    """Rates and their changes are hard; angles are, or give way by s_i >= 0 a motor; poses by one s >= 0 a kind.
+    """Rates and their changes are hard; angles are, or give way; poses give way, each at a price per unit.
 
-    A slack costs w s. The penalty is exact: where the hard problem has a solution, this one has the same. Its matrix is
+    The penalty is exact: where the hard problem has a solution, this one has the same. Many nearly parallel rows are
+    hard on OSQP, so it is given the problem in coordinates V = L'U in which the cost is 1/2 |V - V*|^2 (P = L L'), and
+    every row scaled to length one: hundreds of iterations instead of thousands. Its matrix is
 
-                       U            s of the angles    s of the poses
-        rates        [ constraint   0                  0            ]
-        changes      [ matrix,      0                  0            ]
-        angles  <=   [ see          -1                 0            ]
-        angles  >=   [ `qp`         +1                 0            ]
-        poses   <=   [ C dx/dU      0                  -1           ]
-        slacks       [ 0            1                  1            ]
-
-    with all rows in rad/s, and only C dx/dU, which is block lower triangular, changing from call to call.
+                             V                  s-     s+
+        rates, changes     [ A inv(L')                    ]
+        angles, poses      [ A inv(L')          1      -1 ]
+        slacks             [                    1         ]
+                           [                           1  ]
 
     Parameters
     ----------
@@ -73,40 +73,44 @@ class LimitedQP:
     """
 
     def __init__(self, tuning: Tuning, n: int, dt: float, kinds: tuple[str, ...] = ()) -> None:
-        horizon, size, m = tuning.horizon, tuning.horizon * n, len(kinds)
+        horizon, size = tuning.horizon, tuning.horizon * n
         self._horizon, self._n, self._dt, self._size = horizon, n, dt, size
-        self._kinds = tuple(dict.fromkeys(kinds))
-        self._penalty = _PENALTY * tuning.position_weight
-        matrix = constraint_matrix(horizon, n)
-        angles = matrix[2 * size :]
-        # Every entry of the blocks on and below the diagonal may be there: one as a placeholder.
-        poses = sp.kron(np.tril(np.ones((horizon, horizon))), np.ones((m, n)))
-        by_motor = sp.kron(np.ones((horizon, 1)), sp.identity(n))
-        by_kind = np.tile([[float(kind == one) for one in self._kinds] for kind in kinds], (horizon, 1))
-        slacks = n + len(self._kinds)
-        blocks: list[list[Any]] = [
-            [matrix[: 2 * size], None, None],
-            [angles, -by_motor, None],
-            [angles, by_motor, None],
-            *([[poses, None, sp.csc_matrix(-by_kind)]] if m else []),
-            [None, sp.identity(n), None],
-            *([[None, None, sp.identity(len(self._kinds))]] if m else []),
-        ]
-        extended = sp.csc_matrix(sp.bmat([row[: 3 if m else 2] for row in blocks]))
-        extended.sort_indices()
-        self._data = extended.data.copy()
-        column = np.repeat(np.arange(extended.shape[1]), np.diff(extended.indptr))
-        first = 4 * size
-        changing = (extended.indices >= first) & (extended.indices < first + horizon * m) & (column < size)
-        self._changing = np.flatnonzero(changing)
-        self._rows, self._columns = extended.indices[changing] - first, column[changing]
-        bounds = {"rate": size, "rate change": size, "angle": 2 * size}
-        self._groups = np.array([name for name, count in bounds.items() for _ in range(count)] + list(kinds) * horizon)
-        self._solver = QPSolver(extended, tuning.tolerance, tuning.max_iterations)
-        self._slack_columns = slacks
+        self._kinds = kinds
+        self._motor_rows = np.asfortranarray(constraint_matrix(horizon, n).toarray())
+        self._penalty = _PENALTY * np.sqrt(tuning.position_weight)
+        self._groups = np.array(
+            [kind for kind in ("rate", "rate change", "angle") for _ in range(size)] + [*kinds] * horizon
+        )
+        soft = size + horizon * len(kinds)
+        self._soft = soft
+        rows = 2 * size + soft
+        ties = sp.vstack([sp.csc_matrix((2 * size, 2 * soft)), sp.hstack([sp.identity(soft), -sp.identity(soft)])])
+        matrix = sp.csc_matrix(
+            sp.vstack(
+                [
+                    sp.hstack([sp.csc_matrix(np.ones((rows, size))), ties]),
+                    sp.hstack([sp.csc_matrix((2 * soft, size)), sp.identity(2 * soft)]),
+                ]
+            )
+        )
+        matrix.sort_indices()
+        self._data = matrix.data.copy()
+        self._dense = slice(0, rows * size)  # the first columns are stored first, each in full
+        self._triangle = np.tril_indices(size)
+        # Where each row's neighbour one period later is; the last period's stay.
+        widths = [n, n, n, *([len(kinds)] if kinds else [])]
+        later, first = [], 0
+        for width in [*widths, *widths[2:], *widths[2:]]:
+            rows_of = first + np.arange(horizon * width)
+            later.append(np.append(rows_of[width:], rows_of[-width:]))
+            first += horizon * width
+        self._later = np.concatenate(later)
+        self._last: Solution | None = None
+        self._solver = QPSolver(matrix, _TOLERANCE * tuning.tolerance, tuning.max_iterations, identity=True)
 
     def reset(self) -> None:
         """Start afresh."""
+        self._last = None
         self._solver.reset()
 
     def solve(
@@ -118,60 +122,96 @@ class LimitedQP:
         *,
         soft_angles: bool,
         warm: np.ndarray | None = None,
+        most: int | None = None,
     ) -> Limited:
         """Solve ``qp`` with limits of poses and, if so wanted, with its angle limits softened.
+
+        ``warm`` are inputs to start from, with the last solution's slacks and multipliers moved on by one period;
+        ``most`` iterations are allowed.
 
         Raises
         ------
         InfeasibleError
             As `QPSolver.solve`.
         """
-        n, size, slacks = self._n, self._size, self._slack_columns
-        below, above = np.full(size, -np.inf), np.full(size, np.inf)
-        pose_bounds = np.empty(0)
-        matrix = None
-        if self._kinds:
-            assert limits is not None
-            response, pose_bounds = self._poses(x, models, limits)
-            self._data[self._changing] = response[self._rows, self._columns]
-            matrix = self._data
-        most = np.append(np.full(n, np.inf if soft_angles else 0.0), np.full(slacks - n, np.inf))
-        # The new columns of the upper triangle: zeros, and a little curvature on the diagonal.
-        columns = [np.append(np.zeros(size + i), _CURVATURE * self._penalty) for i in range(slacks)]
-        hard, angles = slice(0, 2 * size), slice(2 * size, None)
+        size, soft = self._size, self._soft
+        rows, lower, upper = self._motor_rows, qp.l, qp.u
+        if limits is not None:
+            response, low, high = self._poses(x, models, limits)
+            rows = np.asfortranarray(np.vstack([rows, response]))
+            lower, upper = np.concatenate([lower, low]), np.concatenate([upper, high])
+        factor = self._factor(qp)
+        rows = dtrsm(1.0, factor, rows, side=1, lower=1, trans_a=1)  # A inv(L')
+        length = np.maximum(np.linalg.norm(rows, axis=1), 1e-12)
+        rows /= length[:, None]
+        self._data[self._dense] = rows.ravel(order="F")
+        slackest = np.full(soft, np.inf)
+        slackest[:size] = np.inf if soft_angles else 0.0
         self._solver.update(
-            np.concatenate([qp.P, *columns]),
-            np.append(qp.q, np.full(slacks, self._penalty * self._dt)),
-            np.concatenate([qp.l[hard], below, qp.l[angles], np.full(len(pose_bounds), -np.inf), np.zeros(slacks)]),
-            np.concatenate([qp.u[hard], qp.u[angles], above, pose_bounds, most]),
-            matrix,
+            None,
+            np.append(dtrsv(factor, qp.q, lower=1), np.full(2 * soft, self._penalty)),
+            np.concatenate([lower / length, np.zeros(2 * soft)]),
+            np.concatenate([upper / length, slackest, slackest]),
+            self._data,
         )
         if warm is not None:
-            self._solver.warm_start(np.append(warm, np.zeros(slacks)))
-        solution = self._solver.solve()
-        given = self._dt * solution.x[size:]
-        slack = {} if given[:n].max() <= _SLACK_SEEN else {"angle": float(given[:n].max())}
-        for kind, amount in zip(self._kinds, given[n:].tolist(), strict=True):
-            if amount > _SLACK_SEEN:
-                assert limits is not None
-                slack[kind] = amount * float(limits.scale[limits.kinds.index(kind)])
-        return Limited(solution.x[:size], None, slack, active_kinds(solution.y, self._groups), solution)
+            slacks, y = np.zeros(2 * soft), np.zeros(self._solver.m)
+            if self._last is not None:
+                y = self._last.y[self._later]
+                slacks = self._last.x[size:][self._later[-2 * soft :] - (2 * size + soft)]
+            self._solver.warm_start(np.append(np.tril(factor).T @ warm, slacks), y)
+        self._last = None
+        self._last = solution = self._solver.solve(most)
+        inputs = dtrsv(factor, solution.x[:size], lower=1, trans=1)
+        given = np.maximum(solution.x[size : size + soft], solution.x[size + soft :])
+        return Limited(
+            inputs,
+            None,
+            self._slack(self._dt * given * length[2 * size :], limits),
+            active_kinds(solution.y, self._groups),
+            solution,
+        )
+
+    def _factor(self, qp: QuadraticProgram) -> np.ndarray:
+        """L, lower triangular, with P = L L'."""
+        lower = np.zeros((self._size, self._size), order="F")
+        lower[self._triangle] = qp.P  # the upper triangle column by column is the lower one row by row
+        factor, failed = dpotrf(lower, lower=1, clean=0)
+        if failed:
+            raise InfeasibleError(
+                f"the QP is not convex: the leading minor {failed} of P is not positive; check weights and model",
+                status="non convex",
+                limit=None,
+            )
+        return np.asarray(factor)
 
     def _poses(
         self, x: np.ndarray, models: Sequence[LinearModel], limits: LinearLimits
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of C x_k + d <= 0 over all periods as (rows) U <= (bounds), both over dt."""
-        n, horizon, m = self._n, self._horizon, len(limits.d)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows over all periods as (bounds) <= (rows) U <= (bounds), all over dt."""
+        n, horizon, m = self._n, self._horizon, len(limits.kinds)
         response = np.zeros((len(x), self._size))
-        rows, bounds = np.empty((horizon * m, self._size)), np.empty(horizon * m)
+        rows, free = np.empty((horizon * m, self._size)), np.empty((horizon, m))
         for k in range(horizon):
             model = models[k] if len(models) > 1 else models[0]
             response = model.A @ response
             response[:, k * n : (k + 1) * n] = model.B
             x = model.A @ x + model.c
             rows[k * m : (k + 1) * m] = limits.C @ response
-            bounds[k * m : (k + 1) * m] = -(limits.C @ x + limits.d)
-        return rows / self._dt, bounds / self._dt
+            free[k] = limits.C @ x
+        low, high = (limits.lower - free) / self._dt, (limits.upper - free) / self._dt
+        return rows / self._dt, low.ravel(), high.ravel()
+
+    def _slack(self, given: np.ndarray, limits: LinearLimits | None) -> dict[str, float]:
+        worst = {"angle": float(given[: self._size].max())}
+        if limits is not None:
+            most = given[self._size :].reshape(self._horizon, -1).max(axis=0) * limits.scale
+            for kind, amount, unit in zip(limits.kinds, most.tolist(), limits.scale.tolist(), strict=True):
+                if amount > _SLACK_SEEN * unit:
+                    worst[kind] = max(worst.get(kind, 0.0), amount)
+        if worst["angle"] <= _SLACK_SEEN:
+            del worst["angle"]
+        return worst
 
 
 def active_kinds(y: np.ndarray, groups: np.ndarray) -> tuple[str, ...]:

@@ -13,10 +13,12 @@ from ..errors import InfeasibleError, checked_vector
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .limited_qp import Limited, LimitedQP, active_kinds
-from .osqp_solver import QPSolver, Solution
+from .osqp_solver import QPSolver
 from .plan import Plan
 from .qp import QuadraticProgram, Reference, Rollout, build_qp, constraint_matrix, model_sequence
 from .tuning import Limits, Tuning
+
+_FEWEST_ITERATIONS = 10  # with which OSQP is tried at all
 
 
 class LinearMPC:
@@ -49,17 +51,17 @@ class LinearMPC:
         if self._workspace is not None:
             self._workspace.reset()
 
-    def prepare(self, model: LinearModel, kinds: tuple[str, ...] = ()) -> None:
+    def prepare(self, model: LinearModel, combinations: Sequence[tuple[str, ...]] = ()) -> None:
         """Take the terminal weight from ``model`` and build the solvers; else the first `solve` does it.
 
-        ``kinds`` are those of the `LinearLimits` to come.
+        ``combinations`` are the kinds that the `LinearLimits` to come may have.
         """
         self._gain, self._terminal_weight = riccati(model, self.tuning)
         self._dt = model.dt
         if self._workspace is None:
             self._workspace = _Workspace(self.tuning, model)
-        for each in {(), kinds}:  # the latter only where a limit comes near
-            self._workspace.limited(each)
+        for kinds in ((), *combinations):
+            self._workspace.limited(kinds)
 
     def solve(
         self,
@@ -188,6 +190,8 @@ class _Workspace:
         self._rates_only = QPSolver(rates, tuning.tolerance, tuning.max_iterations)
         self._groups = np.repeat(["rate", "rate change"], tuning.horizon * self.n)
         self._limited: dict[tuple[str, ...], LimitedQP] = {}
+        self._limits_matter = False  # in the last plan, beside those on the rates
+        self._spent = 0  # iterations in this control step
         self.rollout = Rollout(tuning.horizon, self.n)
 
     def limited(self, kinds: tuple[str, ...]) -> LimitedQP:
@@ -198,6 +202,7 @@ class _Workspace:
 
     def reset(self) -> None:
         """Start afresh."""
+        self._limits_matter = False
         self._rates_only.reset()
         for solver in self._limited.values():
             solver.reset()
@@ -222,35 +227,65 @@ class _Workspace:
         """Solve with the rates' rows alone; where that breaks another limit, or fails, with all of them.
 
         An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half;
-        its multipliers are those of the rates' rows, the others being zero.
+        its multipliers are those of the rates' rows, the others being zero. While other limits shape the plans, the
+        whole is solved at once.
         """
-        n_rates, spent = self._rates_only.m, 0
-        try:
-            self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
-            if warm is not None:
-                self._rates_only.warm_start(warm)
-            solution = self._rates_only.solve()
-        except InfeasibleError as error:
-            spent = error.details.get("iterations", 0)
-        else:
-            states = self.rollout(x, models, solution.x)
-            angles = states[1:, 4:]
-            broken = max(float((limits.angle_lower - angles).max()), float((angles - limits.angle_upper).max()), 0.0)
-            if pose_limits is not None:
-                broken = max(broken, float((states[1:] @ pose_limits.C.T + pose_limits.d).max()))
-            if broken <= self._tuning.tolerance * self.dt:
-                return Limited(solution.x, states, {}, active_kinds(solution.y, self._groups), solution)
-            spent, warm = solution.iterations, solution.x
-        kinds = () if pose_limits is None else pose_limits.kinds
-        answer = self.limited(kinds).solve(qp, x, models, pose_limits, soft_angles=False, warm=warm)
-        return replace(answer, solution=_later(answer.solution, spent))
+        self._spent = 0
+        if not self._limits_matter:
+            n_rates = self._rates_only.m
+            try:
+                self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
+                if warm is not None:
+                    self._rates_only.warm_start(warm)
+                solution = self._rates_only.solve()
+            except InfeasibleError as error:
+                self._spent = error.details.get("iterations", 0)
+            else:
+                states = self.rollout(x, models, solution.x)
+                angles = states[1:, 4:]
+                broken = max(float((limits.angle_lower - angles).max()), float((angles - limits.angle_upper).max()))
+                if pose_limits is not None:
+                    rows = states[1:] @ pose_limits.C.T
+                    broken = max(
+                        broken, float((pose_limits.lower - rows).max()), float((rows - pose_limits.upper).max())
+                    )
+                if broken <= self._tuning.tolerance * self.dt:
+                    return Limited(solution.x, states, {}, active_kinds(solution.y, self._groups), solution)
+                self._spent, warm = solution.iterations, solution.x
+        return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
 
     def soften(
         self, qp: QuadraticProgram, x: np.ndarray, models: Sequence[LinearModel], pose_limits: LinearLimits | None
     ) -> Limited:
-        """Solve with the angle limits softened too."""
+        """Solve with the angle limits softened too, with the iterations that `solve` has left."""
+        return self._solve_whole(qp, x, models, pose_limits, None, soft_angles=True)
+
+    def _solve_whole(
+        self,
+        qp: QuadraticProgram,
+        x: np.ndarray,
+        models: Sequence[LinearModel],
+        pose_limits: LinearLimits | None,
+        warm: np.ndarray | None,
+        soft_angles: bool,
+    ) -> Limited:
         kinds = () if pose_limits is None else pose_limits.kinds
-        return self.limited(kinds).solve(qp, x, models, pose_limits, soft_angles=True)
+        left = self._tuning.max_iterations - self._spent
+        if left < _FEWEST_ITERATIONS:
+            raise InfeasibleError(
+                f"the {self._tuning.max_iterations} iterations allowed are spent", status="maximum iterations reached",
+                iterations=self._spent, limit=None,
+            )  # fmt: skip
+        try:
+            answer = self.limited(kinds).solve(
+                qp, x, models, pose_limits, soft_angles=soft_angles, warm=warm, most=left
+            )
+        except InfeasibleError as error:
+            self._spent += error.details.get("iterations", 0)
+            raise
+        self._spent += answer.solution.iterations
+        self._limits_matter = not set(answer.active) <= {"rate", "rate change"}
+        return replace(answer, solution=replace(answer.solution, iterations=self._spent))
 
 
 def terminal_weight(model: LinearModel, tuning: Tuning) -> np.ndarray:
@@ -279,7 +314,3 @@ def lqr_rates(gain: np.ndarray, x: np.ndarray, reference: Reference, dt: float) 
 
 def _shifted(inputs: np.ndarray) -> np.ndarray:
     return np.concatenate([inputs[1:], inputs[-1:]])
-
-
-def _later(solution: Solution, spent: int) -> Solution:
-    return replace(solution, iterations=spent + solution.iterations)

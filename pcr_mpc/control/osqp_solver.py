@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import osqp
@@ -52,10 +53,15 @@ class QPSolver:
     tolerance : float
         Absolute and relative.
     max_iterations : int
+    identity : bool
+        P is the identity and stays it: `update` takes none.
     """
 
-    def __init__(self, A: sp.csc_matrix, tolerance: float = 1e-5, max_iterations: int = 4000) -> None:
+    def __init__(
+        self, A: sp.csc_matrix, tolerance: float = 1e-5, max_iterations: int = 4000, *, identity: bool = False
+    ) -> None:
         m, n = A.shape
+        self._identity = identity
         self.n, self.m = n, m
         self._n_hessian = n * (n + 1) // 2
         self._matrix = A
@@ -65,12 +71,13 @@ class QPSolver:
             "eps_rel": tolerance,
             "max_iter": max_iterations,
             "adaptive_rho": 1,  # by iterations, not by time
-            "rho": _RHO,
-            "scaling": 2,
+            "rho": 1.0 if self._identity else _RHO,
+            "scaling": 0 if self._identity else 2,
             "check_termination": 5,
             "polishing": False,
         }
         self._dense_a = np.ascontiguousarray(A.toarray())
+        self._data: tuple[Any, ...] | None = None
         self._entries = A.indices * n + np.repeat(np.arange(n), np.diff(A.indptr))  # of the dense one, row by row
         self.reset()
 
@@ -80,22 +87,27 @@ class QPSolver:
         A new workspace: OSQP scales and unscales A at every update of P, and its rounding would stay.
         """
         n, m = self.n, self.m
+        self._osqp, self._data = osqp.OSQP(), None
+        self._most = self._allowed = self._settings["max_iter"]
+        if self._identity:
+            self._osqp.setup(sp.identity(n, format="csc"), np.zeros(n), self._matrix, -np.ones(m), np.ones(m),
+                             **self._settings)  # fmt: skip
+            return
         # An explicit pattern: zeros of the start must not drop out of it.
         rows = np.concatenate([np.arange(j + 1) for j in range(n)])
         starts = np.arange(n + 1) * (np.arange(n + 1) + 1) // 2
         diagonal = (rows == np.repeat(np.arange(n), np.arange(1, n + 1))).astype(float)
         hessian = sp.csc_matrix((diagonal, rows, starts), shape=(n, n))
-        self._osqp = osqp.OSQP()
         self._osqp.setup(hessian, np.zeros(n), self._matrix, -np.ones(m), np.ones(m), **self._settings)
-        self._data: tuple[np.ndarray, ...] | None = None
 
-    def warm_start(self, x: np.ndarray) -> None:
-        """Start the next solve from x, shape (n,), keeping the last multipliers."""
-        self._require(self._osqp.warm_start(self._checked("x", x, self.n), None), "warm_start")
+    def warm_start(self, x: np.ndarray, y: np.ndarray | None = None) -> None:
+        """Start the next solve from x, shape (n,), and multipliers y, shape (m,); None keeps the last ones."""
+        y = None if y is None else self._checked("y", y, self.m)
+        self._require(self._osqp.warm_start(self._checked("x", x, self.n), y), "warm_start")
 
     def update(
         self,
-        P: np.ndarray,
+        P: np.ndarray | None,
         q: np.ndarray,
         l: np.ndarray,  # noqa: E741
         u: np.ndarray,
@@ -106,7 +118,7 @@ class QPSolver:
         Parameters
         ----------
         P : ndarray, shape (n (n + 1) / 2,)
-            Upper triangle, column by column.
+            Upper triangle, column by column; None if it is the identity.
         q : ndarray, shape (n,)
         l, u : ndarray, shape (m,)
             Bounds; infinite entries are allowed.
@@ -121,7 +133,11 @@ class QPSolver:
             Some bounds cross; ``limit`` is the row, and the old data stay. Or P is not convex: then OSQP has lost the
             old data, and needs good ones before it solves again.
         """
-        P, q = self._checked("P", P, self._n_hessian), self._checked("q", q, self.n)
+        q = self._checked("q", q, self.n)
+        if (P is None) != self._identity:
+            raise ValueError("P is the identity of this solver" if self._identity else "P is missing")
+        if P is not None:
+            P = self._checked("P", P, self._n_hessian)
         l, u = self._checked("l", l, self.m, bound=True), self._checked("u", u, self.m, bound=True)  # noqa: E741
         gap = u - l
         if not gap.min() >= 0:
@@ -135,7 +151,7 @@ class QPSolver:
         if A is not None:
             A = self._checked("A", A, self._matrix.nnz)
             self._dense_a.ravel()[self._entries] = A
-        if core.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
+        if (P is not None or A is not None) and core.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
             # OSQP keeps the refused P, and would say "solved" of a mixture.
             self.reset()
             raise InfeasibleError(
@@ -146,8 +162,8 @@ class QPSolver:
         self._require(core.update_data_vec(q=q, l=l, u=u), "update_data_vec")
         self._data = P, q, l, u
 
-    def solve(self) -> Solution:
-        """Solve the current data.
+    def solve(self, most: int | None = None) -> Solution:
+        """Solve the current data, in at most ``most`` iterations if that is less than ``max_iterations``.
 
         Raises
         ------
@@ -160,6 +176,10 @@ class QPSolver:
         if self._data is None:
             raise ValueError("there is no QP to solve: call update first")
         core = self._osqp._solver
+        allowed = self._most if most is None else max(1, min(most, self._most))
+        if allowed != self._allowed:
+            self._osqp.update_settings(max_iter=allowed)
+            self._allowed = allowed
         core.solve()
         info = core.info
         if info.status_val != osqp.SolverStatus.OSQP_SOLVED:
@@ -182,12 +202,18 @@ class QPSolver:
         return Solution(x, y, int(info.iter), primal, dual)
 
     def _residuals(
-        self, x: np.ndarray, y: np.ndarray, hessian: np.ndarray, q: np.ndarray, lower: np.ndarray, upper: np.ndarray
+        self,
+        x: np.ndarray,
+        y: np.ndarray,
+        hessian: np.ndarray | None,
+        q: np.ndarray,
+        lower: np.ndarray,
+        upper: np.ndarray,
     ) -> tuple[float, float]:
         ax = self._dense_a @ x
         primal = max(float((lower - ax).max()), float((ax - upper).max()), 0.0)
         # The upper triangle column by column is BLAS's packed form.
-        gradient = dspmv(self.n, 1.0, hessian, x) + q + y @ self._dense_a
+        gradient = (x if hessian is None else dspmv(self.n, 1.0, hessian, x)) + q + y @ self._dense_a
         return primal, float(np.abs(gradient).max())
 
     @staticmethod

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ..buffered import BufferedFunction
 from ..plant import elastica
-from ..plant.chart import critical_load, critical_load_slope, rough_critical_load
+from ..plant.chart import LEAST_CRITICAL_LOAD, critical_load, critical_load_slope, rough_critical_load
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
+from ..plant.rod_state import RobotState
 from .linear_limits import KINDS, LinearLimits
 
 # How close to a limit a pose must come before the limit is linearised: its controller then looks a horizon ahead.
 _TORQUE_WATCHED = 0.6  # of the limit
 _MARGIN_WATCHED = 0.25  # above the limit
 _STIFFNESS_WATCHED = 3.0  # times the limit
+
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # C, lower, upper, scale
 
 
 @dataclass(frozen=True)
@@ -59,93 +62,113 @@ class LimitWatch:
         self.limits = limits
         self._robot = robot = plant.robot
         self._plant = plant if plant.method == "closed_form" else Plant(robot)
+        given = (limits.torque, limits.tip_lower, limits.rod_margin, limits.stiffness)
+        self._present = tuple(kind for kind, limit in zip(KINDS, given, strict=True) if limit is not None)
         n = robot.n_rods
-        counts = (
-            2 * n * (limits.torque is not None),
-            4 * (limits.tip_lower is not None),
-            n * (limits.rod_margin is not None),
-            1 * (limits.stiffness is not None),
-        )
-        self.kinds = tuple(kind for kind, count in zip(KINDS, counts, strict=True) for _ in range(count))
-        units = (limits.torque, float(robot.lengths.mean()), 1.0, limits.stiffness)
-        self._scale = np.array([u for u, count in zip(units, counts, strict=True) for _ in range(count)], dtype=float)
-        self._first = np.cumsum((0, *counts[:-1])).tolist()
+        self._counts = dict(zip(KINDS, (n, 2, n, 1), strict=True))
         self._moment_units = robot.stiffnesses / robot.lengths
+        # What takes long at first is not left to the first limit that comes near.
+        if limits.rod_margin is not None:
+            critical_load(0.0)
+        if limits.stiffness is not None:
+            self._curvature = BufferedFunction(elastica.rod_curvature())
 
-    @cached_property
-    def _curvature(self) -> BufferedFunction:
-        return BufferedFunction(elastica.rod_curvature())
+    def combinations(self) -> list[tuple[str, ...]]:
+        """Every ``kinds`` that `rows` may give."""
+        return [
+            tuple(kind for kind in some for _ in range(self._counts[kind]))
+            for count in range(1, len(self._present) + 1)
+            for some in itertools.combinations(self._present, count)
+        ]
 
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
         """Follow the branch of ``pose`` from state x."""
         self._plant.reset(x, pose)
 
     def rows(self, x: np.ndarray) -> LinearLimits | None:
-        """Limits about state x, following the branch; None where none of them is near.
+        """Limits that are near state x, following the branch; None if none is.
 
         Raises
         ------
         UnreachableError, ConvergenceError, UnstableError
             As `Plant.force`.
         """
-        if not self.kinds:
+        if not self._present:
             return None
         state = self._plant.rods(x[:2], x[4:])
-        n, limits = self._robot.n_rods, self.limits
-        c, d = np.zeros((len(self.kinds), 4 + n)), np.full(len(self.kinds), -1.0)
-        if limits.torque is not None:
-            tau = -self._moment_units * state.loads[2]
-            if np.abs(tau).max() > _TORQUE_WATCHED * limits.torque:
-                slopes = -self._moment_units[:, None] * state.load_tangents[2].reshape(n, 3)
-                rows = np.hstack(
-                    [slopes[:, :2] / self._robot.lengths[:, None], np.zeros((n, 2)), np.diag(slopes[:, 2])]
-                )
-                rows, offset = rows / limits.torque, (tau - rows @ x) / limits.torque
-                c[: 2 * n], d[: 2 * n] = np.vstack([rows, -rows]), np.append(offset, -offset) - 1.0
-        if limits.tip_lower is not None and limits.tip_upper is not None:
-            at, unit = self._first[1], self._scale[self._first[1]]
-            c[at : at + 2, :2], c[at + 2 : at + 4, :2] = np.eye(2) / unit, -np.eye(2) / unit
-            d[at : at + 4] = np.append(np.negative(limits.tip_upper), limits.tip_lower) / unit
-        if limits.rod_margin is not None:
-            for i in range(n):
-                self._rod_margin(i, state.unknowns[:2, i], state.tangents[:2, 3 * i : 3 * i + 3], x, c, d)
-        if limits.stiffness is not None and state.k[0, 0] < np.inf:
-            a, b, e = float(state.k[0, 0]), float(state.k[0, 1]), float(state.k[1, 1])
-            softest = (a + e) / 2 - math.hypot((a - e) / 2, b)
-            if softest < _STIFFNESS_WATCHED * limits.stiffness:
-                gradient = self._softening(state.unknowns, state.poses, state.k)
-                c[-1] = -gradient / limits.stiffness
-                d[-1] = 1.0 - softest / limits.stiffness + float(gradient @ x) / limits.stiffness
-        return LinearLimits(self.kinds, c, d, self._scale) if c.any() else None
+        near = {
+            "torque": self._torque(x, state),
+            "tip region": self._tip_region(len(x)),
+            "rod margin": self._rod_margins(x, state),
+            "stiffness": self._stiffness(x, state),
+        }
+        found = [(kind, *rows) for kind, rows in near.items() if rows is not None]
+        if not found:
+            return None
+        c, lower, upper, scale = (np.concatenate(parts) for parts in zip(*(rows[1:] for rows in found), strict=True))
+        return LinearLimits(tuple(k for k, *_ in found for _ in range(self._counts[k])), c, lower, upper, scale)
 
-    def _rod_margin(
-        self, i: int, unknowns: np.ndarray, tangent: np.ndarray, x: np.ndarray, c: np.ndarray, d: np.ndarray
-    ) -> None:
-        """Fill in the row of rod i: least - (1 - lambda / lambda_c)."""
-        log_tip_angle, load = unknowns.tolist()
-        least = self.limits.rod_margin
-        assert least is not None
-        if load < (1.0 - least - _MARGIN_WATCHED) * rough_critical_load(log_tip_angle):
-            return
-        critical = critical_load(log_tip_angle)
-        slope = critical_load_slope(log_tip_angle, critical)
-        by_pose = (tangent[1] - load / critical * slope * tangent[0]) / critical
-        row, length = self._first[2] + i, self._robot.rods[i].length
-        c[row, :2], c[row, 4 + i] = by_pose[:2] / length, by_pose[2]
-        d[row] = least - 1.0 + load / critical - float(c[row] @ x)
+    def _torque(self, x: np.ndarray, state: RobotState) -> Rows | None:
+        limit, n = self.limits.torque, len(x) - 4
+        if limit is None:
+            return None
+        tau = -self._moment_units * state.loads[2]
+        if max(map(abs, tau.tolist())) < _TORQUE_WATCHED * limit:
+            return None
+        slopes = -self._moment_units[:, None] * state.load_tangents[2].reshape(n, 3) / limit
+        rows = np.zeros((n, 4 + n))
+        rows[:, :2] = slopes[:, :2] / self._robot.lengths[:, None]
+        rows[:, 4:] = np.diag(slopes[:, 2])
+        rest = tau / limit - rows @ x
+        return rows, -1.0 - rest, 1.0 - rest, np.full(n, limit)
 
-    def _softening(self, unknowns: np.ndarray, poses: np.ndarray, k: np.ndarray) -> np.ndarray:
-        """Gradient of the least eigenvalue of K, shape (4 + n,): v' dK v with v its eigenvector."""
-        n = self._robot.n_rods
-        v = np.linalg.eigh(k)[1][:, 0]
-        gradient = np.zeros(4 + n)
+    def _tip_region(self, n_states: int) -> Rows | None:
+        if self.limits.tip_lower is None or self.limits.tip_upper is None:
+            return None
+        unit = float(self._robot.lengths.mean())
+        lower, upper = np.array(self.limits.tip_lower) / unit, np.array(self.limits.tip_upper) / unit
+        return np.eye(2, n_states) / unit, lower, upper, np.full(2, unit)
+
+    def _rod_margins(self, x: np.ndarray, state: RobotState) -> Rows | None:
+        least, n = self.limits.rod_margin, len(x) - 4
+        if least is None:
+            return None
+        shapes = state.unknowns[:2].T.tolist()
+        near = (1.0 - least - _MARGIN_WATCHED) * LEAST_CRITICAL_LOAD
+        if not any(
+            load > near and load > (1.0 - least - _MARGIN_WATCHED) * rough_critical_load(log_tip_angle)
+            for log_tip_angle, load in shapes
+        ):
+            return None
+        rows, lower = np.zeros((n, 4 + n)), np.empty(n)
+        for i, (log_tip_angle, load) in enumerate(shapes):
+            # Of lambda_c (log tip_angle) too: both follow the pose.
+            critical = critical_load(log_tip_angle)
+            tangent = state.tangents[:2, 3 * i : 3 * i + 3]
+            slope = critical_load_slope(log_tip_angle, critical)
+            by_pose = (load / critical * slope * tangent[0] - tangent[1]) / critical
+            rows[i, :2], rows[i, 4 + i] = by_pose[:2] / self._robot.rods[i].length, by_pose[2]
+            lower[i] = least - (1.0 - load / critical) + float(rows[i] @ x)
+        return rows, lower, np.full(n, np.inf), np.ones(n)
+
+    def _stiffness(self, x: np.ndarray, state: RobotState) -> Rows | None:
+        """The least eigenvalue of K moves as v' dK v, with v its eigenvector."""
+        least = self.limits.stiffness
+        if least is None:
+            return None
+        (a, b), (_, e) = state.k.tolist()
+        softest = (a + e) / 2 - math.hypot((a - e) / 2, b)
+        if softest > _STIFFNESS_WATCHED * least:
+            return None
+        v = np.linalg.eigh(state.k)[1][:, 0]
+        row = np.zeros((1, len(x)))
         for i, rod in enumerate(self._robot.rods):
-            self._curvature.inputs[0][:] = unknowns[:, i]
-            self._curvature.inputs[1][:] = poses[:, i]
+            self._curvature.inputs[0][:] = state.unknowns[:, i]
+            self._curvature.inputs[1][:] = state.poses[:, i]
             self._curvature()
-            unit = rod.bending_stiffness / rod.length**3
-            # Each column holds d K / d pose_j of this rod.
-            by_pose = unit * (np.outer(v, v).ravel() @ self._curvature.outputs[0])
-            gradient[:2] += by_pose[:2] / rod.length
-            gradient[4 + i] = by_pose[2]
-        return gradient
+            unit = rod.bending_stiffness / rod.length**3 / least
+            by_pose = unit * (np.outer(v, v).ravel() @ self._curvature.outputs[0])  # column j: d K / d pose_j
+            row[0, :2] += by_pose[:2] / rod.length
+            row[0, 4 + i] = by_pose[2]
+        lower = 1.0 - softest / least + row @ x
+        return row, lower, np.full(1, np.inf), np.full(1, least)

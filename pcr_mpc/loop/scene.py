@@ -24,7 +24,7 @@ LATE = ("hold", "shifted_plan")
 # Distance of the start from the reference that is taken for the same place [m].
 _START_TOLERANCE = 1e-3
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
-_LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 0.5
+_LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
 
 
 @dataclass(frozen=True)

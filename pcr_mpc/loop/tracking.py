@@ -74,7 +74,7 @@ class TrackingController:
     def _restart(self, x: np.ndarray, pose: Equilibrium, resting: LinearModel) -> None:
         """Forget everything: the robot rests in ``pose``, about which ``resting`` is the linear model."""
         self._law.reset()
-        self._law.prepare(resting, self._watch.kinds)
+        self._law.prepare(resting, self._watch.combinations())
         if self._tuning.observer is not None:
             sensors = self._scene.tip_noise, self._scene.angle_step
             self.observer = DisturbanceObserver(self._tuning.observer, *sensors, resting)

@@ -24,6 +24,7 @@ from scipy.optimize import brentq
 from ..buffered import BufferedFunction
 from . import elastica
 
+LEAST_CRITICAL_LOAD = 5.7659  # of all rods, at k = 0.9427
 _MAX_LOAD = 600.0  # largest lambda on the sheet, about
 _LAMBDA_STEPS = 480  # RK4 steps along each trajectory
 _COLUMNS = 96  # columns of the tabulated sheet
