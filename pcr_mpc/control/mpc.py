@@ -121,7 +121,9 @@ class LinearMPC:
             status, fallback = f"cannot keep {', '.join(answer.slack)}", "softened"
         solved = time.perf_counter()
         inputs = answer.inputs.reshape(-1, n)
-        first_rates = self.limits.clipped(inputs[0], u_previous)
+        # OSQP keeps limits to its tolerance, this keeps them exactly.
+        inside = inputs[0] if fallback else self.limits.within_stops(inputs[0], x[4:], first.dt)
+        first_rates = self.limits.clipped(inside, u_previous)
         states = answer.states
         if states is None or not np.array_equal(inputs[0], first_rates):
             inputs[0] = first_rates
