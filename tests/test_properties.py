@@ -223,7 +223,7 @@ def test_plant_and_linear_model(p, v, q, u, dt):
 def test_mpc(x, previous, wanted):
     tuning = replace(load_tuning(CONTROLLERS / "default.toml"), horizon=5, fallback="raise")
     a = np.eye(6) + 0.01 * np.eye(6, k=2)
-    model = LinearModel(a, 0.01 * np.eye(6, 2, k=-4), np.zeros(6), np.zeros((6, 2)), 0.01)
+    model = LinearModel(a, 0.01 * np.eye(6, 2, k=-4), np.zeros(6), np.zeros((6, 2)), 0.01, np.zeros(2))
     mpc = LinearMPC(tuning, Limits(7.0, 1.0, np.full(2, -2.0), np.full(2, 5.0)))
     reference = Reference(np.tile([*wanted, 0, 0, 0, 0], (5, 1)), np.zeros((5, 2)))
     plan = checked(lambda: mpc.solve(np.array(x), model, reference, np.array(previous)))

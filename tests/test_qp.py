@@ -70,7 +70,7 @@ def test_cost_is_that_of_a_simulation(model, centre, tuning, limits, varying):
             a, b = model.A.copy(), model.B.copy()
             a[:4] += 1e-2 * rng.normal(size=(4, 6))
             b[:4] += 1e-3 * rng.normal(size=(4, 2))
-            models.append(LinearModel(a, b, model.c * np.r_[rng.normal(size=4), 1, 1], model.E, DT))
+            models.append(LinearModel(a, b, model.c * np.r_[rng.normal(size=4), 1, 1], model.E, DT, model.force))
     qp = build_qp(x, models if varying else model, reference, previous, tuning, limits, terminal)
     n = 2 * tuning.horizon
     hessian = full(qp.P, n)
@@ -119,7 +119,7 @@ def test_without_active_limits_the_mpc_is_the_lqr(model, centre, tuning, pair):
 
     tuning = replace(tuning, tolerance=1e-9)
     target = np.concatenate([centre.p, [0, 0], centre.q])
-    balanced = LinearModel(model.A, model.B, target - model.A @ target, model.E, DT)
+    balanced = LinearModel(model.A, model.B, target - model.A @ target, model.E, DT, model.force)
     stage = np.diag([tuning.position_weight] * 2 + [tuning.velocity_weight] * 2 + [tuning.angle_weight] * 2)
     gain, _, _ = control.dlqr(model.A, model.B, stage, tuning.input_weight * np.eye(2))
     x = target + np.array([1e-4, -2e-4, 1e-3, 0.0, 1e-3, -1e-3])

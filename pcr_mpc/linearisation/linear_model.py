@@ -26,6 +26,8 @@ class LinearModel:
         Effect of a constant force on the tip [m/N], [m/s/N], 0.
     dt : float
         Period [s].
+    force : ndarray, shape (2,)
+        The external force that it was made for [N].
     """
 
     A: np.ndarray
@@ -33,6 +35,7 @@ class LinearModel:
     c: np.ndarray
     E: np.ndarray
     dt: float
+    force: np.ndarray
 
     def __post_init__(self) -> None:
         freeze(self)

@@ -71,7 +71,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     a, b, c, e = (output.copy() for output in function.outputs)
     if not np.isfinite(c).all():
         raise ValueError(f"the linear model at x = {x} with external force {f_ext} N is not finite")
-    return LinearModel(a, b, c, e, dt)
+    return LinearModel(a, b, c, e, dt, f_ext.copy())
 
 
 @lru_cache(maxsize=32)
