@@ -195,6 +195,10 @@ class RodSolver:
         """U at the last pose [J]."""
         return float(self._started().scalars[2] @ self._moment_units)
 
+    def unknowns(self) -> np.ndarray:
+        """Unknowns of the method at the last pose, one column a rod, shape (u, n)."""
+        return self._started().unknowns.copy()
+
     def unstable_rods(self) -> tuple[int, ...]:
         """Rods with a conjugate point at the last pose."""
         return self._started().unstable_rods
