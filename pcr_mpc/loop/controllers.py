@@ -161,7 +161,9 @@ class TrackingMPC:
         self._on_the_way.append(self._u)
         arriving = self._on_the_way.popleft()
         if models is not None:
-            self._predicts = now or (models if isinstance(models, LinearModel) else models[0])
+            # A plan may know better than the models it was asked for.
+            better = models if plan.models is None or plan.fallback else plan.models
+            self._predicts = now or (better if isinstance(better, LinearModel) else better[0])
         if observer is not None:
             observer.predict(self._predicts, arriving)
         return Decision(plan.inputs[0], plan, linearised)
