@@ -1,0 +1,1 @@
+"""This project's controllers beside those of others, on the same problem."""
