@@ -188,12 +188,12 @@ def test_the_last_plan_answers_as_long_as_it_lasts(tuning, target, centre, model
     assert mpc.solve(beyond, model, out_of_reach, again.inputs[0]).fallback == "shifted_plan"
 
 
-def test_a_missing_measurement_is_answered(tuning, target, centre, model, reference, pair, wide):
-    mpc = make_nonlinear_mpc(pair, centre, tuning, wide)
+def test_a_missing_measurement_is_answered(tuning, target, centre, model, reference, pair):
+    mpc = make_nonlinear_mpc(pair, centre, tuning, Limits(6.0, 2.0, *pair.angle_limits.T))
     mpc.prepare(model)
     plan = mpc.fall_back("no measurement", np.full(6, np.nan), reference, np.array([5.0, 0.0]))
     assert (plan.fallback, plan.status, plan.models) == ("hold", "no measurement", None)
-    assert plan.inputs[:, 0] == pytest.approx([2.0] + [0.0] * (tuning.horizon - 1))
+    assert plan.inputs[:, 0] == pytest.approx([3.0, 1.0] + [0.0] * (tuning.horizon - 2))
     with pytest.raises(ValueError, match="x is not finite"):
         mpc.solve(np.full(6, np.nan), model, reference, np.zeros(2))
 
