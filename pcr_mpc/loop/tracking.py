@@ -9,6 +9,7 @@ import numpy as np
 
 from ..control.laws import LQR, PD, FeedForward, Law
 from ..control.mpc import LinearMPC
+from ..control.nonlinear_mpc import NonlinearMPC
 from ..control.observer import DisturbanceObserver
 from ..control.plan import Plan
 from ..control.qp import Reference
@@ -21,6 +22,7 @@ from ..linearisation.pose_limits import LimitWatch
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.robot import Robot
+from ..plant.symbolic import rod_unknowns, symbolic_dynamics
 from .along_plan import AlongPlan
 from .controllers import Controller, Decision, HoldMotors
 from .feed_forward import feed_forward
@@ -57,12 +59,15 @@ class TrackingController:
         self._on_the_way: deque[np.ndarray] = deque()
         self._u = np.zeros(self.robot.n_rods)
         self._plan: Plan | None = None
-        self._law = self._make_law(motor_limits(scene.robot, scene.period))
+        self._inverse = MotorTarget(self.robot)
+        self._law: Law | None = None
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference."""
         self._reference = feed_forward(self._scene, self.robot, pose, self._tuning.horizon + self._delay)
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
+        if self._law is None:
+            self._law = self._make_law(pose)
         model = self._make_model()
         model.reset(x, pose)
         resting = linearise(model, x, np.zeros(self.robot.n_rods), self._scene.period)
@@ -73,6 +78,7 @@ class TrackingController:
 
     def _restart(self, x: np.ndarray, pose: Equilibrium, resting: LinearModel) -> None:
         """Forget everything: the robot rests in ``pose``, about which ``resting`` is the linear model."""
+        assert self._law is not None
         self._law.reset()
         self._law.prepare(resting, self._watch.combinations())
         if self._tuning.observer is not None:
@@ -114,6 +120,7 @@ class TrackingController:
             failure, models = f"no linear model: {error}", None
         linearised = time.perf_counter() - began
         window = self._window(k + self._delay, force)
+        assert self._law is not None
         if models is None:
             plan = self._law.fall_back(failure, ahead, window, self._u)
         else:
@@ -122,7 +129,9 @@ class TrackingController:
         self._on_the_way.append(self._u)
         arriving = self._on_the_way.popleft()
         if models is not None:
-            self._predicts = now or (models if isinstance(models, LinearModel) else models[0])
+            # A plan may know better than the models that it was asked for with.
+            better = models if plan.models is None or plan.fallback else plan.models
+            self._predicts = now or (better if isinstance(better, LinearModel) else better[0])
         if observer is not None:
             observer.predict(self._predicts, arriving)
         return Decision(plan.inputs[0], plan, linearised)
@@ -155,16 +164,18 @@ class TrackingController:
         model = self._tuning.model
         return Plant(self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme)
 
-    def _make_law(self, limits: Limits) -> Law:
-        law = self._tuning.law
-        self._inverse = MotorTarget(self.robot)
-        if law == "pd":
-            return PD(self._tuning, limits, lambda p, q, force: q + self._inverse.shift(p, q, force))
-        if law == "lqr":
-            return LQR(self._tuning, limits)
-        if law == "feed_forward":
-            return FeedForward(self._tuning, limits)
-        return LinearMPC(self._tuning, limits)
+    def _make_law(self, pose: Equilibrium) -> Law:
+        tuning, limits = self._tuning, motor_limits(self._scene.robot, self._scene.period)
+        if tuning.law == "linear_mpc":
+            return LinearMPC(tuning, limits)
+        if tuning.law == "nonlinear_mpc":
+            hands, algebraic = rod_unknowns(self.robot, pose)
+            return NonlinearMPC(tuning, limits, symbolic_dynamics(self.robot, hands), algebraic)
+        if tuning.law == "lqr":
+            return LQR(tuning, limits)
+        if tuning.law == "pd":
+            return PD(tuning, limits, lambda p, q, force: q + self._inverse.shift(p, q, force))
+        return FeedForward(tuning, limits)
 
 
 def motor_limits(robot: Robot, period: float) -> Limits:

@@ -71,6 +71,13 @@ def _tip(log_tip_angle: Any, load: Any) -> tuple[Any, Any, Any, Any]:
     return tip, delta, rate, load**2 * ca.cos(ca.exp(log_tip_angle)) - load * c
 
 
+def beyond_limit(determinant: Any, unknowns: Any) -> Any:
+    """Whether a rod with its tip held is past its limit of stability, by the determinant of its tip's Jacobian."""
+    # It is negative on the stable sheet, and its first zero is the limit. It turns negative again at the second
+    # zero, which lies beyond this line for every tip angle.
+    return ca.logic_or(determinant >= 0, unknowns[1] > 2 * (np.log(8.0) - unknowns[0]) + 5)
+
+
 @lru_cache
 def tip_map() -> Any:
     """Graph [log tip_angle, lambda] -> tip (2), its Jacobian (2, 2), energy, for a left-handed rod."""
@@ -108,10 +115,7 @@ def rod_newton() -> tuple[Any, Any]:
     moves = inverse @ ca.jacobian(target, pose)
     load_moves = ca.jacobian(loads, unknowns[:2]) @ moves + ca.jacobian(loads, pose)
     norm = ca.norm_2(residual)
-    # The determinant is negative on the stable sheet, and its first zero is the limit of stability.
-    # It turns negative again at the second zero, which lies beyond this line for every tip angle.
-    beyond = ca.logic_or(determinant >= 0, load > 2 * (np.log(8.0) - unknowns[0]) + 5)
-    scalars = ca.vertcat(norm, ca.norm_2(step), energy, beyond, 0)
+    scalars = ca.vertcat(norm, ca.norm_2(step), energy, beyond_limit(determinant, unknowns), 0)
     results = [ca.vertcat(step, 0), ca.vertcat(moves, ca.SX(1, 3)), loads, load_moves, scalars]
     options = {"cse": True}
     newton = ca.Function("rod_newton", [unknowns, pose], [ca.densify(r) for r in results], options)
