@@ -60,14 +60,14 @@ def test_rows_are_values_and_gradients(pair, poses):
         limit = np.array([1.0, 1.0, 0.25, 0.75, 0.6, 0.6, 1.0])
         slack = np.where(np.isfinite(rows.upper), rows.upper, rows.lower) - rows.C @ x
         assert slack == pytest.approx(limit - value, abs=1e-8)
-        h, slopes = 1e-5, np.zeros((7, 6))
+        h, slopes = 5e-7, np.zeros((7, 6))
         for j in (0, 1, 4, 5):
             ahead, back = x.copy(), x.copy()
             ahead[j] += h
             back[j] -= h
             ends = [quantities(solve_statics(pair, at[:2], at[4:], guess=pose)) for at in (ahead, back)]
             slopes[:, j] = (ends[0] - ends[1]) / (2 * h)
-        assert rows.C == pytest.approx(slopes, abs=1e-6 * np.abs(slopes).max())
+        assert rows.C == pytest.approx(slopes, abs=1e-6 * np.abs(slopes).max() + 1e-5)
 
 
 def test_third_derivatives_of_the_energy_commute(pair, poses):
