@@ -191,6 +191,10 @@ class RodSolver:
         """F = sum n_i = dU/dp at the last pose, shape (2,) [N]."""
         return self._started().force
 
+    def unknowns(self) -> np.ndarray:
+        """Unknowns of the method at the last pose, shape (width, n)."""
+        return self._started().unknowns
+
     def energy(self) -> float:
         """U at the last pose [J]."""
         return float(self._started().scalars[2] @ self._moment_units)
