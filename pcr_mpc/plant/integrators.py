@@ -54,7 +54,9 @@ class _Symbols:
     def coriolis(self, v: Any) -> Any:
         """d/dp of the kinetic energy at given velocities."""
         w = ca.vertcat(v, self.u)
-        return self.slopes[:, :2].T @ ca.vec(w @ w.T) / 2
+        # Not by way of w w', which overflows for velocities that a massless rod would bear.
+        slopes = [ca.reshape(self.slopes[:, k], 2 + self.n, 2 + self.n) for k in (0, 1)]
+        return ca.vertcat(*(ca.dot(slope @ w, w) / 2 for slope in slopes))
 
     def at_rest(self, momentum: Any) -> Any:
         """Velocity v of the tip with the motors at rest: M_pp v = momentum."""
