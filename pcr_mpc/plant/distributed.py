@@ -1,9 +1,10 @@
 """The robot with rods of distributed mass: what the condensed inertia is measured against.
 
-Unknowns are the strain modes of the rods and the tip, joined by an exact pin: the tips of all rods are p. Time steps are
-Gauss collocation with two stages (order 4, symplectic but for the pin) on Lagrange's equations with the pin at acceleration
-level, after which positions and velocities are moved onto it along the directions in which the pin's forces act. The
-stiff modes that a step does not resolve stay bounded. Damping is the tip's drag alone: vibrations of the rods live on.
+Unknowns are the strain modes of the rods and the tip, joined by an exact pin: the tips of all rods are p. Time steps
+are Gauss collocation with two stages (order 4, symplectic but for the pin) on Lagrange's equations with the pin at
+acceleration level, after which positions and velocities are moved onto it along the directions in which the pin's
+forces act. The stiff modes that a step does not resolve stay bounded. Damping is the tip's drag alone: vibrations of
+the rods live on.
 """
 
 from __future__ import annotations
@@ -91,6 +92,7 @@ class DistributedRods:
         a_dot = np.linalg.solve(systems, moves)[:, :-2, 0]
         return ModalState(a, a_dot, np.array(p), np.array(v), np.array(q), np.zeros(len(q)))
 
+    @np.errstate(over="ignore", invalid="ignore")  # in iterations that diverge, which fail
     def step(self, state: ModalState, u: np.ndarray, f_ext: np.ndarray, dt: float) -> ModalState:
         """Advance by ``dt`` with the motors turning at ``u`` (n), from whose jump the rods take an impulse.
 
@@ -204,18 +206,18 @@ class DistributedRods:
         return replace(state, a_dot=a_dot, v=state.v + change[width - 2 : width], u=u.copy())
 
     def _pinned(self, state: ModalState) -> ModalState:
-        """Tips brought together again, and their velocities."""
+        """Tips brought together again, then their velocities."""
         n, width, lengths = self.robot.n_rods, self._n_modes + 2, self.robot.lengths[:, None]
-        right = np.zeros((self._size, 2))
-        right[width:, 0] = (state.p - self.robot.bases - lengths * self.modes.tips(state.a, state.q)).ravel()
+
+        def correction(gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            change = self._solve(state, np.concatenate([np.zeros(width), gaps.ravel()]))
+            return change[: width - 2].reshape(n, -1), change[width - 2 : width]
+
+        of_modes, of_tip = correction(state.p - self.robot.bases - lengths * self.modes.tips(state.a, state.q))
+        state = replace(state, a=state.a + of_modes, p=state.p + of_tip)
         velocities = self.modes.tip_velocities(state.a, state.a_dot, state.q, state.u)
-        right[width:, 1] = (state.v - lengths * velocities).ravel()
-        change = self._solve(state, right)
-        moves, changes = (change[: width - 2, k].reshape(n, -1) for k in (0, 1))
-        moved, faster = change[width - 2 : width].T
-        return replace(
-            state, a=state.a + moves, a_dot=state.a_dot + changes, p=state.p + moved, v=state.v + faster
-        )
+        of_modes, of_tip = correction(state.v - lengths * velocities)
+        return replace(state, a_dot=state.a_dot + of_modes, v=state.v + of_tip)
 
 
 def _error(what: str, size: float, iterations: int, last: np.ndarray) -> ConvergenceError:

@@ -26,7 +26,7 @@ from scipy.special import roots_jacobi
 from .elastica import elliptic
 from .robot import Robot
 
-INERTIAS = ("none", "constant", "condensed")
+INERTIAS = ("none", "constant", "condensed", "full")
 # Points along a rod, beside the tip: 1e-5 of its inertia (1e-3 of the smallest entries) where rods are bent like those
 # of the default robot, 1e-2 within per cents of their limit of stability.
 _POINTS = 6

@@ -1,9 +1,9 @@
 """Rods with distributed mass in strain modes: theta_i(s) = q_i + sum_j a_ij int_0^s P_j, P_j Legendre's on [0, 1].
 
-A rod cannot stretch, and its bending energy EI/L sum_j a_j^2 / (2 (2 j + 1)) is diagonal, so that Lagrange's equations need
-no penalty and converge spectrally in the number of modes. Lengths are in L, energies in EI/L, forces in EI/L^2; what is
-left of the line density is beta = mu L^4 / EI [s^2]. Along a rod everything is taken at Gauss points: with S the
-matrix that integrates from the base, w the weights, c = cos(theta) and s = sin(theta), a point moves with
+A rod cannot stretch, and its bending energy EI/L sum_j a_j^2 / (2 (2 j + 1)) is diagonal, so that Lagrange's
+equations need no penalty and converge spectrally in the number of modes. Lengths are in L, energies in EI/L, forces
+in EI/L^2; what is left of the line density is beta = mu L^4 / EI [s^2]. Along a rod everything is taken at Gauss
+points: with S the matrix that integrates from the base, c = cos(theta) and s = sin(theta), a point moves with
 
     r'' = S (-s theta'' - c theta'^2, c theta'' - s theta'^2),
 
