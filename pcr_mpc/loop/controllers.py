@@ -194,7 +194,10 @@ class TrackingMPC:
 
     def _make_model(self) -> Plant:
         model = self._tuning.model
-        return Plant(self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme)
+        return Plant(
+            self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
+            inertia=model.inertia,
+        )  # fmt: skip
 
 
 def motor_limits(robot: Robot, period: float) -> Limits:
