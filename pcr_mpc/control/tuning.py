@@ -15,6 +15,7 @@ METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 SCHEMES = ("rk4", "rk8")
 LAWS = ("linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward")
 LINEARISE = ("here", "along_plan")
+INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
 
 
@@ -26,6 +27,8 @@ class Model:
     ----------
     method, segments, steps, scheme
         Discretisation of the rods (see `solve_statics`).
+    inertia : {"none", "constant", "condensed"}
+        Of the rods (see `Plant`).
     linearise : {"here", "along_plan"}
         Once, at the current state, or at every period of the last plan (real-time iteration).
     predict_delay : bool
@@ -36,6 +39,7 @@ class Model:
     segments: int = 8
     steps: int = 1
     scheme: str = "rk8"
+    inertia: str = "none"
     linearise: str = "here"
     predict_delay: bool = True
 
@@ -184,6 +188,7 @@ def load_tuning(path: str | Path) -> Tuning:
                 segments=model.integer("segments", Model.segments),
                 steps=model.integer("steps", Model.steps),
                 scheme=model.text("scheme", Model.scheme, choices=SCHEMES),
+                inertia=model.text("inertia", Model.inertia, choices=INERTIAS),
                 linearise=model.text("linearise", Model.linearise, choices=LINEARISE),
                 predict_delay=model.boolean("predict_delay", Model.predict_delay),
             ),

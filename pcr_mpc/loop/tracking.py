@@ -162,7 +162,10 @@ class TrackingController:
 
     def _make_model(self) -> Plant:
         model = self._tuning.model
-        return Plant(self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme)
+        return Plant(
+            self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
+            inertia=model.inertia,
+        )  # fmt: skip
 
     def _make_law(self, pose: Equilibrium) -> Law:
         tuning, limits = self._tuning, motor_limits(self._scene.robot, self._scene.period)
