@@ -138,7 +138,7 @@ def measure(name: str, case: Case, label: str) -> dict[str, Any]:
 def plot(rows: list[dict[str, Any]], found: dict[str, Case], path: Path) -> None:
     """Error against time per step, a panel for each kind of case; the bar leads from the median to p99."""
     panels = list(dict.fromkeys(case.panel for case in found.values()))
-    figure, axes = plt.subplots(2, 4, figsize=(14, 6.6), sharex=True, layout="constrained")
+    figure, axes = plt.subplots(2, 4, figsize=(14, 6.6), sharex=True, sharey=True, layout="constrained")
     for at, panel in zip(axes.flat, panels, strict=False):
         for label, (_, colour, marker) in CONTROLLERS.items():
             mine = [r for r in rows if r["controller"] == label and found[r["case"]].panel == panel]

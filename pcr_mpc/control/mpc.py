@@ -9,13 +9,13 @@ from dataclasses import replace
 import control
 import numpy as np
 
-from ..errors import InfeasibleError, checked_vector
+from ..errors import InfeasibleError, checked_array, checked_vector
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .limited_qp import Limited, LimitedQP, active_kinds
 from .osqp_solver import QPSolver
 from .plan import Plan
-from .qp import QuadraticProgram, Reference, Rollout, build_qp, constraint_matrix, model_sequence
+from .qp import QuadraticProgram, Reference, Rollout, assemble, constraint_matrix, model_sequence
 from .tuning import Limits, Tuning
 
 _FEWEST_ITERATIONS = 10  # with which OSQP is tried at all
@@ -98,12 +98,16 @@ class LinearMPC:
         first = sequence[0]
         n_states, n = first.B.shape
         x, u_previous = checked_vector("x", x, n_states), checked_vector("u_previous", u_previous, n)
+        horizon = self.tuning.horizon
+        wanted = checked_array("reference.states", reference.states, (horizon, n_states))
+        feed_forward = checked_array("reference.inputs", reference.inputs, (horizon, n))
         if self._terminal_weight is None or self._workspace is None:
             self.prepare(first)
         assert self._terminal_weight is not None
         assert self._workspace is not None
-        self._workspace.require(first)
-        qp = build_qp(x, models, reference, u_previous, self.tuning, self.limits, self._terminal_weight)
+        self._workspace.require(sequence)
+        window = Reference(wanted, feed_forward)
+        qp = assemble(x, sequence, window, u_previous, self.tuning, self.limits, self._terminal_weight)
         warm = None if self._last is None else _shifted(self._last.inputs).ravel()
         updated = time.perf_counter()
         status, fallback = "solved", None
@@ -125,7 +129,7 @@ class LinearMPC:
         inside = inputs[0] if fallback else self.limits.within_stops(inputs[0], x[4:], first.dt)
         first_rates = self.limits.clipped(inside, u_previous)
         states = answer.states
-        if states is None or not np.array_equal(inputs[0], first_rates):
+        if states is None or inputs[0].tolist() != first_rates.tolist():
             inputs[0] = first_rates
             states = self._workspace.rollout(x, sequence, inputs)
         self._age = 0
@@ -209,9 +213,11 @@ class _Workspace:
         for solver in self._limited.values():
             solver.reset()
 
-    def require(self, model: LinearModel) -> None:
-        """Raise if the model is for another robot or period."""
-        if (model.B.shape[1], model.dt) != (self.n, self.dt):
+    def require(self, models: Sequence[LinearModel]) -> None:
+        """Raise if a model is for another robot or period."""
+        for model in models:
+            if (model.B.shape[1], model.dt) == (self.n, self.dt):
+                continue
             raise ValueError(
                 f"model has {model.B.shape[1]} motors and dt = {model.dt} s, but this controller was built for "
                 f"{self.n} and {self.dt} s; make a new one"

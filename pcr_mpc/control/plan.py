@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..frozen import freeze
 from ..linearisation.linear_model import LinearModel
 
 # From the best answer to the last resort.
@@ -56,4 +55,6 @@ class Plan:
     solve_time: float = 0.0
 
     def __post_init__(self) -> None:
-        freeze(self)
+        self.inputs.flags.writeable = False
+        if self.states is not None:
+            self.states.flags.writeable = False

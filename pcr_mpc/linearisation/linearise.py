@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from ..buffered import BufferedFunction
 from ..errors import checked_number, checked_vector
@@ -59,7 +59,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     force, k, g = plant.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
     inertia, slopes = plant.mass(x[:2], x[4:])
     mass, drag = plant.robot.tip_mass, plant.robot.drag
-    stiffness, damping = float(np.abs(k).max()) * dt * dt / mass, drag * dt / mass
+    stiffness, damping = max(map(abs, k.ravel().tolist())) * dt * dt / mass, drag * dt / mass
     if not (stiffness <= _STIFFEST and damping * damping <= _STIFFEST):
         raise ValueError(
             f"dt = {dt} s is too long for the stiffness at p = {x[:2]} m or for the drag: K dt^2/m is {stiffness:.3g} "
@@ -74,15 +74,19 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     function.inputs[4][:] = drag, dt
     function.inputs[5][:], function.inputs[6][:] = inertia, slopes
     function()
-    a, b, c, e = (output.copy() for output in function.outputs)
-    if not np.isfinite(c).all():
+    packed = function.outputs[0].copy()
+    n = plant.n_states
+    a, c = packed[: n * n].reshape(n, n, order="F"), packed[n * n : n * (n + 1)]
+    b, e = packed[n * (n + 1) : -2 * n].reshape(n, -1, order="F"), packed[-2 * n :].reshape(n, 2, order="F")
+    if not all(map(math.isfinite, c.tolist())):
         raise ValueError(f"the linear model at x = {x} with external force {f_ext} N is not finite")
     return LinearModel(a, b, c, e, dt, f_ext.copy())
 
 
 @lru_cache(maxsize=32)
 def _discretisation(n: int, thread: int) -> BufferedFunction:
-    """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q)) -> (A, B, c, E)."""
+    """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q)) -> [A, c, B, E],
+    column by column in one vector."""
     k, g, force = ca.SX.sym("K", 2, 2), ca.SX.sym("G", 2, n), ca.SX.sym("F", 2)
     x, parameters = ca.SX.sym("x", 4 + n), ca.SX.sym("parameters", 2)
     mass, slopes = ca.SX.sym("M", 2 + n, 2 + n), ca.SX.sym("dM", (2 + n) ** 2, 2 + n)
@@ -132,6 +136,6 @@ def _discretisation(n: int, thread: int) -> BufferedFunction:
     moved = exponential @ state - phi_1 @ scale @ force
     c_vector = ca.vertcat(p + moved[:2], moved[2:] / dt, q) - a_matrix @ x
     e_matrix = ca.vertcat(ca.diag(units) @ phi_1 @ scale, ca.SX(n, 2))
-    results = [a_matrix, b_matrix, c_vector, e_matrix]
+    results = [ca.vertcat(ca.vec(a_matrix), c_vector, ca.vec(b_matrix), ca.vec(e_matrix))]
     arguments = [k, g, force, x, parameters, mass, slopes]
     return BufferedFunction(ca.Function("discretise", arguments, results, {"cse": True}))
