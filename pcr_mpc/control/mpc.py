@@ -146,6 +146,7 @@ class LinearMPC:
             dual_residual=answer.solution.dual_residual,
             update_time=updated - began,
             solve_time=solved - updated,
+            solver_time=answer.solution.run_time,
         )
         return self._last
 
@@ -197,7 +198,7 @@ class _Workspace:
         self._groups = np.repeat(["rate", "rate change"], tuning.horizon * self.n)
         self._limited: dict[tuple[str, ...], LimitedQP] = {}
         self._limits_matter = False  # in the last plan, beside those on the rates
-        self._spent = 0  # iterations in this control step
+        self._spent, self._inside = 0, 0.0  # iterations and seconds of OSQP in this control step
         self.rollout = Rollout(tuning.horizon, self.n)
 
     def limited(self, kinds: tuple[str, ...]) -> LimitedQP:
@@ -238,7 +239,7 @@ class _Workspace:
         its multipliers are those of the rates' rows, the others being zero. While other limits shape the plans, the
         whole is solved at once.
         """
-        self._spent = 0
+        self._spent, self._inside = 0, 0.0
         if not self._limits_matter:
             n_rates = self._rates_only.m
             try:
@@ -247,7 +248,7 @@ class _Workspace:
                     self._rates_only.warm_start(warm)
                 solution = self._rates_only.solve()
             except InfeasibleError as error:
-                self._spent = error.details.get("iterations", 0)
+                self._count(error)
             else:
                 states = self.rollout(x, models, solution.x)
                 angles = states[1:, 4:]
@@ -259,7 +260,7 @@ class _Workspace:
                     )
                 if broken <= self._tuning.tolerance * self.dt:
                     return Limited(solution.x, states, {}, active_kinds(solution.y, self._groups), solution)
-                self._spent, warm = solution.iterations, solution.x
+                self._spent, self._inside, warm = solution.iterations, solution.run_time, solution.x
         return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
 
     def soften(
@@ -289,11 +290,17 @@ class _Workspace:
                 qp, x, models, pose_limits, soft_angles=soft_angles, warm=warm, most=left
             )
         except InfeasibleError as error:
-            self._spent += error.details.get("iterations", 0)
+            self._count(error)
             raise
         self._spent += answer.solution.iterations
+        self._inside += answer.solution.run_time
         self._limits_matter = not set(answer.active) <= {"rate", "rate change"}
-        return replace(answer, solution=replace(answer.solution, iterations=self._spent))
+        solution = replace(answer.solution, iterations=self._spent, run_time=self._inside)
+        return replace(answer, solution=solution)
+
+    def _count(self, error: InfeasibleError) -> None:
+        self._spent += error.details.get("iterations", 0)
+        self._inside += error.details.get("run_time", 0.0)
 
 
 def terminal_weight(model: LinearModel, tuning: Tuning) -> np.ndarray:

@@ -37,8 +37,8 @@ class Plan:
         Of the solver.
     primal_residual, dual_residual : float
         Recomputed from the problem's data; NaN if unsolved.
-    update_time, solve_time : float
-        Assembling the problem, and handing it over and solving it [s].
+    update_time, solve_time, solver_time : float
+        Assembling the problem; handing it over and solving it; of that, inside the solver's own code [s].
     """
 
     inputs: np.ndarray
@@ -53,6 +53,7 @@ class Plan:
     dual_residual: float = float("nan")
     update_time: float = 0.0
     solve_time: float = 0.0
+    solver_time: float = 0.0
 
     def __post_init__(self) -> None:
         self.inputs.flags.writeable = False
