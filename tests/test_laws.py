@@ -74,6 +74,16 @@ def test_lqr_settles_like_its_closed_loop_matrix(at_rest, pair):
         assert cost(gain * (1 + 1e-2 * rng.standard_normal(gain.shape))) > best
 
 
+def test_lqr_on_a_moving_reference_is_the_feed_forward(at_rest, pair):
+    x, model = at_rest
+    law = LQR(load_tuning(CONTROLLERS / "lqr.toml"), Limits(1e3, 1e3, *pair.angle_limits.T))
+    law.prepare(model)
+    now, rates = x + np.array([0, 0, 0.2, -0.1, 0, 0]), np.array([0.3, 0.7])
+    after = now + DT * np.concatenate([now[2:4], [0, 0], rates])
+    plan = law.solve(now, model, Reference(after[None], rates[None]), np.zeros(2))
+    assert plan.inputs[0] == pytest.approx(rates, abs=1e-9)
+
+
 def test_pd_moves_the_motors_to_the_inverse_statics_of_a_displaced_tip(pair, centre, at_rest):
     x, model = at_rest
     tuning = replace(load_tuning(CONTROLLERS / "pd.toml"), pd=(0.5, 0.0))
