@@ -32,12 +32,15 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/basins.py --seeds 3 --out results/basins
 	cp results/basins/*.png docs/
 	$(BIN)/python experiments/linear_validity.py --out docs
+	$(BIN)/python experiments/fold_guard.py --out results/fold_guard
+	$(BIN)/python experiments/controllers.py --out results/controllers
+	cp results/fold_guard/*.png results/controllers/*.png docs/
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
 	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers]"
 	touch $(READY)
 
 clean:
