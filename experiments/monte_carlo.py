@@ -29,7 +29,7 @@ import numpy as np
 from scipy.stats import binomtest, spearmanr
 
 from pcr_mpc import PCRError, Scene, SimulationError, Tuning, load_scene, load_tuning
-from pcr_mpc.loop.episodes import ALLOWED_ERROR, SETTLING, Spread, run_episode, simulate_episode
+from pcr_mpc.loop.episodes import ALLOWED_ERROR, SETTLING, Spread, lighter, run_episode, simulate_episode
 from pcr_mpc.loop.parallel import collect, local_workers
 from pcr_mpc.loop.provenance import described, source_digest
 from pcr_mpc.report.plots import animate_run, plot_run
@@ -40,6 +40,10 @@ Row = dict[str, Any]
 MODELS = Path(__file__).parent.parent / "models"
 QUANTILES = {"p5": 0.05, "p50": 0.5, "p95": 0.95, "max": 1.0}
 DEFAULT_SCENE = MODELS / "scenes" / "lemniscate.toml"
+
+
+# Kinds of mismatch, as they are drawn from top to bottom.
+KINDS = ("delay", "load", "bending stiffness", "tip mass", "drag", "bases", "tip noise", "encoder step")
 
 
 def sizes(row: Row) -> dict[str, float]:
@@ -61,14 +65,12 @@ def sizes(row: Row) -> dict[str, float]:
 
 
 def correlations(rows: list[Row]) -> dict[str, float]:
-    """Spearman's rank correlation of the RMS error with each kind of mismatch; NaN where that did not vary."""
+    """Spearman's rank correlation of the RMS error with each kind of mismatch that varies."""
     known = [row for row in rows if row["rms_mm"] is not None]
     rms = [row["rms_mm"] for row in known]
     columns = {name: [sizes(row)[name] for row in known] for name in sizes(rows[0])}
-    return {
-        name: float(spearmanr(values, rms).statistic) if min(len(set(values)), len(set(rms))) > 1 else math.nan
-        for name, values in columns.items()
-    }
+    varying = {name: values for name, values in columns.items() if min(len(set(values)), len(set(rms))) > 1}
+    return {name: float(spearmanr(values, rms).statistic) for name, values in varying.items()}
 
 
 def worst(rows: list[Row]) -> Row:
@@ -100,7 +102,7 @@ def summarise(rows: list[Row]) -> dict[str, Any]:
         "episodes_with_fallbacks": sum(row["fallbacks"] > 0 for row in rows),
         "worst_seed": worst(rows)["seed"],
         "worst_failure": worst(rows)["failure"],
-        "rank_correlation": {name: None if math.isnan(v) else v for name, v in correlations(rows).items()},
+        "rank_correlation": correlations(rows),
     }
 
 
@@ -129,11 +131,11 @@ def report(summary: dict[str, Any], replay: str) -> str:
         (name, *("-" if value is None else f"{value:.3g}" for value in summary[key].values())) for name, key in shown
     ]
     lines += ["", table(("all episodes", *QUANTILES), cells), ""]
-    ranked = sorted(summary["rank_correlation"].items(), key=lambda pair: -abs(pair[1] or 0.0))
+    ranked = sorted(summary["rank_correlation"].items(), key=lambda pair: -abs(pair[1]))
     lines += [
         f"limit violations  {summary['limit_violations']}",
         f"fall-backs in     {summary['episodes_with_fallbacks']} episodes",
-        f"RMS goes with     {', '.join(f'{name} {value:+.2f}' for name, value in ranked if value is not None)}",
+        f"RMS goes with     {', '.join(f'{name} {value:+.2f}' for name, value in ranked)}",
         f"worst episode     seed {summary['worst_seed']}: {summary['worst_failure'] or 'no failure'}",
         f"  replay it with  {replay} --replay {summary['worst_seed']}",
     ]
@@ -144,11 +146,12 @@ def plot(rows: list[Row], title: str, path: Path) -> None:
     """Distribution of the RMS error, what goes with it, and the error against the load."""
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13.5, 4.2), layout="constrained")
     known = [row for row in rows if row["rms_mm"] is not None]
-    groups = (("as told", 0, BLUE, "o"), ("one period or more longer than told", 1, ORANGE, "^"))
-    for label, delayed, colour, marker in groups:
-        mine = sorted((r for r in known if (r["delay"] > 0) == bool(delayed)), key=lambda row: row["rms_mm"])
+    told, longer = ([row for row in known if (row["delay"] > 0) == late] for late in (False, True))
+    groups = (("as told", told, BLUE, "o"), ("longer than told", longer, ORANGE, "^"))
+    for number, (label, mine, colour, marker) in enumerate(groups):
         if not mine:
             continue
+        mine = sorted(mine, key=lambda row: row["rms_mm"])
         rms = np.array([row["rms_mm"] for row in mine])
         share = 100 * (np.arange(len(mine)) + 1) / len(mine)
         failed = np.array([bool(row["failure"]) for row in mine])
@@ -157,6 +160,9 @@ def plot(rows: list[Row], title: str, path: Path) -> None:
         load = np.array([sizes(row)["load"] for row in mine])
         right.plot(load[~failed], rms[~failed], marker, color=colour, ms=4, alpha=0.7, label=f"delay {label}")
         right.plot(load[failed], rms[failed], "x", color=RED, ms=5)
+        among = correlations(mine)
+        places = [KINDS.index(name) + 0.27 * (number + 1) for name in among]
+        middle.barh(places, list(among.values()), height=0.25, color=colour, label=f"among delay {label}")
     failures = sum(bool(row["failure"]) for row in rows)
     for axes in (left, right):
         axes.plot([], [], "x", color=RED, ms=5, label=f"failed: {failures} of {len(rows)}")
@@ -164,10 +170,14 @@ def plot(rows: list[Row], title: str, path: Path) -> None:
     left.set_ylim(0, 118)
     left.legend(loc="upper left", fontsize=8)
 
-    ranked = sorted(((n, v) for n, v in correlations(rows).items() if not math.isnan(v)), key=lambda pair: abs(pair[1]))
-    middle.barh([name for name, _ in ranked], [value for _, value in ranked], color=GREY)
+    everything = correlations(rows)
+    places = [KINDS.index(name) for name in everything]
+    middle.barh(places, list(everything.values()), height=0.25, color=GREY, label="among all episodes")
     middle.axvline(0.0, color="black", lw=0.8)
-    middle.set(xlabel="rank correlation of RMS error and size [-]", title="What matters", xlim=(-1, 1))
+    middle.set_yticks(np.arange(len(KINDS)) + 0.27, KINDS)
+    middle.set(xlabel="rank correlation of RMS error and size [-]", xlim=(-1, 1), xticks=(-1, -0.5, 0, 0.5, 1),
+               ylim=(len(KINDS), -2.6), title="What matters")  # fmt: skip
+    middle.legend(loc="upper left", fontsize=8)
 
     right.set(yscale="log", xlabel="size of the unknown load [N]", ylabel="RMS error of an episode [mm]",
               title="Error against load")  # fmt: skip
@@ -253,9 +263,7 @@ def _study(options: argparse.Namespace) -> int:
     episodes, duration = (8, 1.2) if options.quick else (options.episodes, options.duration)
     if episodes < 1:
         raise ValueError(f"--episodes is {episodes}, expected at least 1")
-    # Verlet costs a third of RK4, and its error is nothing beside the mismatch.
-    plant = replace(scene.plant, integrator="velocity_verlet")
-    scene = replace(scene, duration=min(scene.duration, duration), plant=plant).tuned(tuning)
+    scene = lighter(replace(scene, duration=min(scene.duration, duration))).tuned(tuning)
     folder = options.out or Path("results") / "monte_carlo" / f"{scene.name}_{tuning.name}"
     folder.mkdir(parents=True, exist_ok=True)
     if options.replay is not None:
