@@ -1,23 +1,30 @@
-"""Command line: track a scene, solve a pose, time the loop."""
+"""Command line: track a scene, solve a pose, time the loop, tune a controller."""
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import math
 import re
 import sys
 import traceback
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from .control.tuning import load_tuning
 from .errors import PCRError, SimulationError
+from .loop.episodes import Spread, lighter
+from .loop.parallel import local_workers
+from .loop.provenance import commit
 from .loop.run import Run
 from .loop.scene import load_scene
 from .loop.simulate import simulate
 from .loop.timing import time_scene
 from .loop.tracking import make_controller
+from .loop.tuning_file import default_path, write_tuning
+from .loop.tuning_study import Search, finished_trials, tune
 from .plant.dynamics import Plant
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
@@ -25,7 +32,16 @@ from .plant.robot import load_robot
 from .plant.stability import all_equilibria, assess_stability
 from .plant.statics import METHODS, solve_statics
 from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
-from .report.tables import equilibria_table, equilibrium_record, equilibrium_table, summary_table, times_table
+from .report.tables import (
+    equilibria_table,
+    equilibrium_record,
+    equilibrium_table,
+    summary_table,
+    times_table,
+    tuning_comments,
+    tuning_table,
+)
+from .report.trade_off import plot_trade_off
 
 _EXAMPLES = """\
 examples:
@@ -35,6 +51,7 @@ examples:
   pcr-mpc statics models/rfrfr.toml --q 120 60 --degrees           where the free tip comes to rest
   pcr-mpc statics models/planar_pair.toml --p 0.18 0.12 --equilibria   what else it could snap to
   pcr-mpc timing models/scenes/lemniscate.toml           step times against the real-time budgets
+  pcr-mpc tune models/scenes/pick_and_place.toml --trials 20 --jobs 2     a better controller for it
 """
 
 
@@ -50,8 +67,8 @@ def main(arguments: list[str] | None = None) -> int:
             traceback.print_exc()
         print(f"pcr-mpc: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("pcr-mpc: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"pcr-mpc: {str(interrupt) or 'interrupted'}", file=sys.stderr)
         return 130
 
 
@@ -105,6 +122,23 @@ def _parser() -> argparse.ArgumentParser:
     timing = command("timing", _timing, "Time plant steps of every method and the control step against their budgets.")
     timing.add_argument("scene", type=Path, help="scene file")
     timing.add_argument("--steps", type=int, default=2000, help="plant steps per method (default 2000)")
+
+    tuning = command(
+        "tune",
+        _tune,
+        "Search for a better tuning of a scene's linear MPC, with Optuna; write it if there is one. "
+        "A study goes on where the last call with the same settings ended.",
+    )
+    tuning.add_argument("scene", type=Path, help="scene file; its tuning is where the search starts")
+    tuning.add_argument("--trials", type=int, default=50, help="to add to the study (default 50)")
+    tuning.add_argument("--jobs", type=int, default=1, help="processes on this machine (default 1)")
+    tuning.add_argument("--storage", metavar="URL", help="Optuna storage, for several machines "
+                      "(default SQLite in results/tune/SCENE)")  # fmt: skip
+    tuning.add_argument("--episodes", type=int, default=6, help="with mismatch, in each trial (default 6)")
+    tuning.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
+    tuning.add_argument(
+        "--out", type=Path, metavar="FILE", help="tuning to write (default SCENE.toml beside the scene's)"
+    )
     return parser
 
 
@@ -202,6 +236,40 @@ def _timing(options: argparse.Namespace) -> int:
     print(f"\n{scene.name}\n\n{times_table(rows)}\n")
     print(f"relative error of F along the run: {', '.join(errors)}")
     print(", ".join(f"{name} {value}" for name, value in {**result["machine"], **result["versions"]}.items()))
+    return 0
+
+
+def _tune(options: argparse.Namespace) -> int:
+    scene = load_scene(options.scene)
+    for name in ("trials", "jobs", "episodes"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"--{name} is {getattr(options, name)}, expected at least 1")
+    folder = Path("results") / "tune" / scene.name
+    folder.mkdir(parents=True, exist_ok=True)
+    storage = options.storage or f"sqlite:///{folder / 'study.db'}"
+    search = Search(lighter(scene), Spread(), options.episodes, options.seed, storage)
+    with local_workers(options.jobs) as executor:
+        chosen = tune(search, options.trials, executor)
+    trials = finished_trials(search)
+    files = {name: str(folder / name) for name in ("trials.csv", "trade_off.png")}
+    with open(files["trials.csv"], "w", newline="", encoding="utf-8") as handle:
+        writer = csv.DictWriter(handle, fieldnames=list(trials[0]))
+        writer.writeheader()
+        writer.writerows(trials)
+    plot_trade_off(trials, chosen.trial if chosen else None, f"Tuning for {scene.name}", folder / "trade_off.png")
+    if chosen is not None:
+        path = options.out or default_path(options.scene, scene.name)
+        comments = tuning_comments(search, chosen, len(trials), commit())
+        write_tuning(replace(chosen.tuning, name=path.stem), path, comments)
+        files[path.name] = str(path)
+    record = {"scene": scene.name, "trials": len(trials), "storage": storage, "files": files,
+              "chosen": {**asdict(chosen), "file": str(path)} if chosen else None}  # fmt: skip
+    if options.json:
+        print(json.dumps(record))
+    elif chosen is None:
+        print(f"\nnone of {len(trials)} trials beats {search.start.name}: no tuning is written; see {folder}")
+    else:
+        print(f"\n{tuning_table(search, chosen)}\n\nwritten to {path}; the study is in {folder}")
     return 0
 
 

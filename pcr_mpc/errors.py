@@ -65,6 +65,10 @@ class SimulationError(PCRError):
     """A closed-loop run ended early; ``run`` holds everything until then."""
 
 
+class StudyError(PCRError):
+    """A study of many runs cannot go on, or ended without some of its results; names the file of those that it has."""
+
+
 def checked_vector(name: str, value: Any, size: int) -> np.ndarray:
     """Return ``value`` as a finite float64 vector of ``size`` entries, or say what it is instead.
 

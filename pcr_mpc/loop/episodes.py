@@ -1,0 +1,263 @@
+"""Episodes under mismatch: the robot that moves is not quite the one that the controller believes in."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..control.tuning import Tuning
+from ..errors import SimulationError, checked_number
+from .run import Run
+from .scene import Scene
+from .simulate import simulate
+from .tracking import make_controller
+
+Row = dict[str, Any]
+# An episode fails if the tip is further than this from its reference [m]: a third of the lemniscate's height, and
+# almost four times as far as the largest load of a `Spread` moves the resting tip.
+ALLOWED_ERROR = 0.02
+# The loads strike at t = 0; from then on the loop has this long to make up for them [s].
+SETTLING = 1.0
+# A cluster's worker may have several threads, but the rods' graphs of a process share their memory.
+_ONE_AT_A_TIME = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """What is off in one episode.
+
+    Attributes
+    ----------
+    stiffness : tuple of float, one a rod
+        True bending stiffness EI over the believed one.
+    mass, drag : float
+        True tip mass and drag over the believed ones.
+    base_offset : tuple of (float, float), one a rod
+        Where the motor really is, less where it is believed to be [m].
+    delay : int
+        Control periods of the scene by which commands come later than the controller knows.
+    tip_noise : float
+        Standard deviation of the measured tip position, beside the scene's own [m].
+    angle_step : float
+        Resolution of the encoders, if coarser than the scene's [rad]. It stands on the data sheet: the controller
+        knows it, as it knows the scene's.
+    force : (float, float)
+        External force on the tip, beside the scene's own [N].
+    """
+
+    stiffness: tuple[float, ...]
+    mass: float
+    drag: float
+    base_offset: tuple[tuple[float, float], ...]
+    delay: int
+    tip_noise: float
+    angle_step: float
+    force: tuple[float, float]
+
+    def applied_to(self, scene: Scene) -> Scene:
+        """Return the scene as it really is."""
+        rods = tuple(
+            replace(
+                rod,
+                bending_stiffness=factor * rod.bending_stiffness,
+                base=(rod.base[0] + offset[0], rod.base[1] + offset[1]),
+            )
+            for rod, factor, offset in zip(scene.robot.rods, self.stiffness, self.base_offset, strict=True)
+        )
+        robot = replace(
+            scene.robot, rods=rods, tip_mass=self.mass * scene.robot.tip_mass, drag=self.drag * scene.robot.drag
+        )
+        return replace(
+            scene,
+            robot=robot,
+            delay=scene.delay + self.delay,
+            tip_noise=math.hypot(scene.tip_noise, self.tip_noise),
+            angle_step=max(scene.angle_step, self.angle_step),
+            force=(scene.force[0] + self.force[0], scene.force[1] + self.force[1]),
+        )
+
+    def row(self) -> Row:
+        """Plain columns, with units in their names."""
+        return {
+            **{f"stiffness{i}": factor for i, factor in enumerate(self.stiffness)},
+            "mass": self.mass,
+            "drag": self.drag,
+            **{f"base{i}_{axis}_m": offset[j] for i, offset in enumerate(self.base_offset)
+               for j, axis in enumerate("xy")},
+            "delay": self.delay,
+            "tip_noise_m": self.tip_noise,
+            "angle_step_rad": self.angle_step,
+            "force_x_N": self.force[0],
+            "force_y_N": self.force[1],
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far off things may be. Uniform within the ranges, independent of each other.
+
+    Attributes
+    ----------
+    stiffness : float
+        EI of each rod is off by up to this fraction. Wire of 1.5 mm comes to 0.02 mm, which is 5 % of EI (d^4), and
+        the modulus of spring steel is given as 190 to 210 GPa, another 5 %.
+    mass : float
+        Tip mass, by up to this fraction: a payload of 50 g on 250 g.
+    drag : float
+        Between 1/drag and drag times the believed value, uniform in its logarithm: of friction one knows the size only.
+    base_offset : float
+        Each coordinate of each motor, by up to this [m]: a bench drilled by hand.
+    delay : int
+        0 to this many control periods more than the controller was told: a bus or a camera that takes one longer.
+    tip_noise : float
+        Up to this standard deviation [m]; twice that of the good camera in the scene "sensors".
+    angle_step : float
+        Up to this resolution [rad]: encoders of 12 bits a turn and better.
+    force : float
+        Any direction, up to this [N]: 40 % of the weight of the tip mass, as in "hold_with_load".
+    """
+
+    stiffness: float = 0.1
+    mass: float = 0.2
+    drag: float = 2.0
+    base_offset: float = 1e-3
+    delay: int = 1
+    tip_noise: float = 1e-4
+    angle_step: float = 2 * math.pi / 4096
+    force: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "mass"):
+            checked_number(name, getattr(self, name), minimum=0.0, maximum=0.99)
+        for name in ("base_offset", "delay", "tip_noise", "angle_step", "force"):
+            checked_number(name, getattr(self, name), minimum=0.0)
+        checked_number("drag", self.drag, minimum=1.0)
+
+    def sample(self, n_rods: int, seed: int) -> Mismatch:
+        """Draw what is off in the episode of a seed; depends on nothing else."""
+        rng = np.random.default_rng([seed, 1])  # not the stream of the measurement noise, default_rng(seed)
+        stiffness = 1.0 + self.stiffness * rng.uniform(-1.0, 1.0, n_rods)
+        offsets = self.base_offset * rng.uniform(-1.0, 1.0, (n_rods, 2))
+        direction, size = rng.uniform(0.0, 2 * math.pi), self.force * rng.uniform()
+        return Mismatch(
+            stiffness=tuple(stiffness.tolist()),
+            mass=1.0 + self.mass * rng.uniform(-1.0, 1.0),
+            drag=self.drag ** rng.uniform(-1.0, 1.0),
+            base_offset=tuple((x, y) for x, y in offsets.tolist()),
+            delay=int(rng.integers(0, self.delay, endpoint=True)),
+            tip_noise=self.tip_noise * rng.uniform(),
+            angle_step=self.angle_step * rng.uniform(),
+            force=(size * math.cos(direction), size * math.sin(direction)),
+        )
+
+
+# Everything is as the controller believes.
+EXACT = Spread(stiffness=0.0, mass=0.0, drag=1.0, base_offset=0.0, delay=0, tip_noise=0.0, angle_step=0.0, force=0.0)
+
+
+def lighter(scene: Scene) -> Scene:
+    """Return the scene with velocity Verlet: it costs a third of RK4, and its error is nothing beside the mismatch."""
+    return replace(scene, plant=replace(scene.plant, integrator="velocity_verlet"))
+
+
+def simulate_episode(
+    scene: Scene, tuning: Tuning, seed: int, spread: Spread = Spread(), *, progress: bool = False
+) -> Run:
+    """Run the episode of a seed: the sampled robot moves, the controller knows the scene's.
+
+    Late decisions are not simulated, even where the scene has a deadline: an episode must not depend on how busy the
+    machine is.
+
+    Raises
+    ------
+    SimulationError
+        As `simulate`.
+    """
+    believed = replace(scene.tuned(tuning), deadline=math.inf)
+    mismatch = spread.sample(scene.robot.n_rods, seed)
+    # A tuning with a shorter period does not make the bus faster.
+    delay = math.ceil(mismatch.delay * scene.period / believed.period - 1e-9)
+    true = replace(mismatch, delay=delay).applied_to(believed)
+    controller = make_controller(replace(believed, angle_step=true.angle_step), robot=believed.robot)
+    return simulate(true, true.make_plant(), controller, seed, progress=progress)
+
+
+def run_episode(scene: Scene, tuning: Tuning, seed: int, spread: Spread = Spread()) -> Row:
+    """Run the episode of a seed and judge it; a failing one is a row like the others.
+
+    Returns
+    -------
+    dict
+        Ready for JSON: ``seed``; what was off (see `Mismatch.row`); ``failure``, empty if there was none; ``rms_mm``,
+        ``rms_after_1s_mm``, ``max_mm``, ``final_error_mm``; ``effort_rad_s2``, the RMS change of the commanded rates;
+        ``limit_violations``; ``fallbacks`` and ``rungs``, how the decisions came about where not by a solved QP;
+        ``run_hash``. What there was no run to tell of is None. All this repeats bit for bit on one machine;
+        ``timing`` does not: ``control_cpu_us``, the median CPU time of a control step, ``late``, the share of control
+        steps whose CPU time exceeds the period, and ``episode_s``.
+    """
+    began = time.perf_counter()
+    row: Row = {"seed": seed, **spread.sample(scene.robot.n_rods, seed).row(), "failure": ""}
+    run: Run | None = None
+    with _ONE_AT_A_TIME:
+        try:
+            run = simulate_episode(scene, tuning, seed, spread)
+        except SimulationError as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                raise KeyboardInterrupt from error
+            run, row["failure"] = error.run, str(error)
+        except Exception as error:  # before the first step, as a reference that the believed robot cannot follow
+            row["failure"] = f"{type(error).__name__}: {error}"
+    row |= _figures(run)
+    if run is not None:
+        row["failure"] = row["failure"] or _verdict(run, row["limit_violations"])
+    row["timing"] = {**_timing(run), "episode_s": time.perf_counter() - began}
+    return row
+
+
+def _verdict(run: Run, violations: int) -> str:
+    """Why a run that came to its end is a failure; empty if it is none."""
+    if violations:
+        return f"limits violated in {violations} of {len(run.u)} periods"
+    first = int(np.searchsorted(run.t, min(SETTLING, run.t[-1])))
+    worst = first + int(run.error[first:].argmax())
+    if not run.error[worst] <= ALLOWED_ERROR:  # so written that NaN fails
+        return f"strayed {1e3 * run.error[worst]:.1f} mm from the reference at t = {run.t[worst]:.3f} s"
+    return ""
+
+
+def _figures(run: Run | None) -> Row:
+    if run is None or not len(run.u):
+        names = ("rms_mm", "rms_after_1s_mm", "max_mm", "final_error_mm", "effort_rad_s2")
+        return {**dict.fromkeys(names), "limit_violations": 0, "fallbacks": 0, "rungs": "", "run_hash": ""}
+    error = 1e3 * run.error
+    late = error[run.t >= 1.0]
+    change = np.diff(run.u, axis=0, prepend=np.zeros((1, run.u.shape[1]))) / run.scene.period
+    rungs = Counter(event["rung"] for event in run.events if event["kind"] == "fallback")
+    return {
+        "rms_mm": _rms(error),
+        "rms_after_1s_mm": _rms(late) if len(late) else None,
+        "max_mm": float(error.max()),
+        "final_error_mm": float(error[-1]),
+        "effort_rad_s2": _rms(change),
+        "limit_violations": run.limit_violations(),
+        "fallbacks": rungs.total(),
+        "rungs": ", ".join(f"{name} {count}" for name, count in sorted(rungs.items())),
+        "run_hash": run.hash(),
+    }
+
+
+def _timing(run: Run | None) -> Row:
+    if run is None or not len(run.u):
+        return {"control_cpu_us": None, "late": None}
+    cpu = run.control_time[:, 5]
+    return {"control_cpu_us": 1e6 * float(np.median(cpu)), "late": float(np.mean(cpu > run.scene.period))}
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

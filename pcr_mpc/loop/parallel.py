@@ -1,0 +1,192 @@
+"""Many independent tasks on any `concurrent.futures.Executor`; what is finished is kept."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+from ..errors import StudyError
+from .provenance import differences
+
+Row = dict[str, Any]
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
+# Libraries that spread over all cores would fight for those of the other workers.
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@contextmanager
+def local_workers(jobs: int | None = None) -> Iterator[ProcessPoolExecutor]:
+    """Open ``jobs`` processes on this machine (None: one for each core that is ours), one thread each."""
+    jobs = available_cores() if jobs is None else jobs
+    if jobs < 1:
+        raise ValueError(f"jobs is {jobs}, expected at least 1")
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(_ONE_THREAD)  # new interpreters read it before they load anything
+    try:
+        # Not forked: a fork of a process with threads may hang.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_leave_interrupts_to_the_parent) as executor:
+            yield executor
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    # Ctrl-C in a terminal reaches all; a worker brings its task to its end, and the parent begins no other.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def finished(
+    executor: Executor,
+    task: Callable[[Argument], Result],
+    arguments: Sequence[Argument],
+    *,
+    desc: str,
+    unit: str,
+    before: int = 0,
+    progress: bool = True,
+) -> Iterator[tuple[Argument, Result]]:
+    """Run a task for each argument; yield argument and result as they come.
+
+    Parameters
+    ----------
+    executor : Executor
+    task : callable
+        Importable where it runs.
+    arguments : sequence
+    desc, unit : str
+        Of the progress bar on stderr.
+    before : int
+        Tasks that were finished before, for the progress bar.
+    progress : bool
+        Show it.
+
+    Raises
+    ------
+    StudyError
+        At the end, if tasks were left without a result: a worker died, or the task raised. ``lost`` are their
+        arguments.
+    """
+    futures: dict[Future[Result], Argument] = {}
+    lost: list[tuple[Argument, Exception]] = []
+    try:
+        for argument in arguments:
+            try:
+                futures[executor.submit(task, argument)] = argument
+            except BrokenExecutor as error:
+                lost.append((argument, error))
+        bar = tqdm(as_completed(futures), desc=desc, unit=unit, initial=before, total=before + len(futures),
+                   disable=not progress)  # fmt: skip
+        for future in bar:
+            try:
+                result = future.result()
+            except Exception as error:
+                lost.append((futures[future], error))
+            else:
+                yield futures[future], result
+    finally:  # interrupted, or the caller has had enough
+        for future in futures:
+            future.cancel()
+    if lost:
+        first, cause = lost[0]
+        raise StudyError(
+            f"{len(lost)} of {len(arguments)} tasks ended without a result; the first, {first}: "
+            f"{type(cause).__name__}: {cause}",
+            lost=[argument for argument, _ in lost],
+        ) from cause
+
+
+def collect(
+    executor: Executor,
+    task: Callable[[int], Row],
+    seeds: Sequence[int],
+    path: Path,
+    settings: Mapping[str, Any],
+    *,
+    desc: str,
+    unit: str = "episode",
+    progress: bool = True,
+) -> list[Row]:
+    """Rows of a task for each seed, in the order of the seeds; resumes what an earlier call has left in a file.
+
+    Each row is appended to the file as soon as it is there, as one line of JSON. A first line holds the settings.
+
+    Parameters
+    ----------
+    executor, task, desc, unit, progress
+        As for `finished`; the row of a seed has it as its ``seed``.
+    seeds : sequence of int
+    path : Path
+    settings : mapping
+        Ready for JSON; rows in the file are taken only if theirs were the same.
+
+    Raises
+    ------
+    StudyError
+        The file is of other settings, or some rows are still missing; those that there are are in the file.
+    KeyboardInterrupt
+        Says how to go on.
+    """
+    rows = _rows_so_far(path, dict(settings))
+    missing = [seed for seed in dict.fromkeys(seeds) if seed not in rows]
+    before = len(set(seeds)) - len(missing)
+    kept = f"those that there are are kept in {path}, and the same command goes on from there"
+    try:
+        with open(path, "a", encoding="utf-8") as file:
+            for seed, row in finished(executor, task, missing, desc=desc, unit=unit, before=before, progress=progress):
+                line = json.dumps(row)
+                file.write(line + "\n")
+                file.flush()
+                rows[seed] = json.loads(line)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted with {len(rows)} rows finished; {kept}") from None
+    except StudyError as error:
+        raise StudyError(f"{error}; {kept}", **error.details) from error.__cause__
+    return [rows[seed] for seed in sorted(set(seeds))]
+
+
+def _rows_so_far(path: Path, settings: dict[str, Any]) -> dict[int, Row]:
+    """Rows in the file, by seed; begins it if there is none. A last line that was cut off is cut away."""
+    text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+    whole = text[: text.rfind("\n") + 1]
+    lines = whole.splitlines()
+    if not lines:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"settings": settings}) + "\n", encoding="utf-8")
+        return {}
+    try:
+        header, *rows = map(json.loads, lines)
+        theirs = header["settings"]
+        found = {int(row["seed"]): row for row in rows}
+    except (ValueError, KeyError, TypeError) as error:
+        raise StudyError(f"{path}: not a file of a study ({error}); move it away", path=str(path)) from error
+    changed = differences(theirs, settings)
+    if changed:
+        more = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
+        raise StudyError(
+            f"{path} holds {len(found)} rows of other settings: {changed[0]}{more}; move it away to begin anew",
+            path=str(path),
+            differences=changed,
+        )
+    if len(whole) < len(text):
+        path.write_text(whole, encoding="utf-8")
+    return found

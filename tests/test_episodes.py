@@ -1,0 +1,164 @@
+"""Episodes under mismatch: repeatable, judged, and unknown to the controller."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcr_mpc import load_scene, make_controller, simulate
+from pcr_mpc.loop import episodes
+from pcr_mpc.loop.controllers import HoldMotors
+from pcr_mpc.loop.episodes import ALLOWED_ERROR, EXACT, Spread, run_episode, simulate_episode
+from pcr_mpc.loop.trajectory import Hold
+
+from .conftest import MODELS
+
+
+@pytest.fixture(scope="module")
+def scene():
+    scene = load_scene(MODELS / "scenes" / "lemniscate.toml")
+    return replace(scene, duration=0.3, plant=replace(scene.plant, integrator="velocity_verlet"))
+
+
+def repeatable(row):
+    return {name: value for name, value in row.items() if name != "timing"}
+
+
+def test_same_seed_same_row_bit_for_bit(scene):
+    rows = [run_episode(scene, scene.tuning, seed) for seed in (3, 4, 3)]
+    assert repeatable(rows[0]) == repeatable(rows[2])
+    for name in ("stiffness0", "stiffness1", "mass", "drag", "base0_x_m", "base1_y_m", "tip_noise_m", "angle_step_rad",
+                 "force_x_N", "rms_mm", "run_hash"):  # fmt: skip
+        assert rows[0][name] != rows[1][name], name
+    assert json.loads(json.dumps(rows[0])) == rows[0]
+
+
+def test_samples_fill_their_ranges_and_nothing_else():
+    spread = Spread()
+    samples = [spread.sample(2, seed) for seed in range(2000)]
+    columns = {
+        "stiffness": (np.array([m.stiffness for m in samples]), 0.9, 1.1),
+        "mass": (np.array([m.mass for m in samples]), 0.8, 1.2),
+        "log drag": (np.log([m.drag for m in samples]), -math.log(2), math.log(2)),
+        "base": (np.array([m.base_offset for m in samples]), -1e-3, 1e-3),
+        "delay": (np.array([m.delay for m in samples]), 0, 1),
+        "tip noise": (np.array([m.tip_noise for m in samples]), 0.0, 1e-4),
+        "angle step": (np.array([m.angle_step for m in samples]), 0.0, 2 * math.pi / 4096),
+        "force": (np.hypot(*np.array([m.force for m in samples]).T), 0.0, 1.0),
+    }
+    for name, (values, low, high) in columns.items():
+        assert values.min() >= low, name
+        assert values.max() <= high, name
+        assert values.min() < low + 0.01 * (high - low), name
+        assert values.max() > high - 0.01 * (high - low), name
+        assert values.mean() == pytest.approx((low + high) / 2, abs=0.03 * (high - low)), name
+    # Independent of each other, to five standard errors.
+    drawn = np.column_stack([values.reshape(len(samples), -1) for values, _, _ in columns.values()])
+    assert np.abs(np.corrcoef(drawn.T) - np.eye(drawn.shape[1])).max() < 5 / math.sqrt(len(samples))
+
+
+@pytest.mark.parametrize("wrong", [{"stiffness": -0.1}, {"mass": 1.0}, {"drag": 0.5}, {"force": math.nan}])
+def test_a_spread_out_of_range_is_named(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Spread(**wrong)
+
+
+def test_the_robot_is_another_and_the_controller_does_not_know(scene, monkeypatch):
+    """The sampled robot moves; the controller is given the scene's, but for its encoders' data sheet."""
+    given = {}
+
+    def spy(believed, robot):
+        given.update(scene=believed, robot=robot)
+        return HoldMotors(robot.n_rods)
+
+    monkeypatch.setattr(episodes, "make_controller", spy)
+    scene = replace(scene, delay=1, force=(0.1, 0.0), tip_noise=3e-5)
+    mismatch = replace(Spread().sample(2, 5), delay=1)
+    monkeypatch.setattr(Spread, "sample", lambda *_: mismatch)
+    run = simulate_episode(scene, scene.tuning, 5)
+    true = run.scene
+    assert given["robot"] == given["scene"].robot == scene.robot
+    assert given["scene"] == replace(scene, angle_step=true.angle_step)
+    for rod, nominal, factor, offset in zip(
+        true.robot.rods, scene.robot.rods, mismatch.stiffness, mismatch.base_offset, strict=True
+    ):
+        assert rod.bending_stiffness == factor * nominal.bending_stiffness != nominal.bending_stiffness
+        assert np.subtract(rod.base, nominal.base) == pytest.approx(offset)
+    assert true.robot.tip_mass == mismatch.mass * scene.robot.tip_mass != scene.robot.tip_mass
+    assert true.robot.drag == mismatch.drag * scene.robot.drag != scene.robot.drag
+    assert true.robot.angle_limits == pytest.approx(scene.robot.angle_limits)
+    assert (true.delay, given["scene"].delay) == (2, 1)
+    assert true.tip_noise == math.hypot(3e-5, mismatch.tip_noise)
+    assert true.force == (0.1 + mismatch.force[0], mismatch.force[1])
+    # The run starts in balance at the reference, which the believed robot would not with these motors.
+    assert run.x[0, :2] == pytest.approx([0.0, 0.25], abs=1e-9)
+    assert np.abs(run.x[0, 4:] - scene.start().q).max() > 1e-3
+
+
+def test_without_mismatch_it_is_the_scene(scene):
+    plain = simulate(scene, scene.make_plant(), make_controller(scene), seed=9)
+    row = run_episode(scene, scene.tuning, 9, EXACT)
+    assert row["run_hash"] == plain.hash()
+    assert row["rms_mm"] == pytest.approx(plain.summary()["rms_mm"])
+    assert row["max_mm"] == plain.summary()["max_mm"]
+    change = np.diff(np.vstack([np.zeros(2), plain.u]), axis=0) / 0.01
+    assert row["effort_rad_s2"] == pytest.approx(math.sqrt((change**2).mean()))
+    assert (row["failure"], row["limit_violations"], row["fallbacks"], row["rungs"]) == ("", 0, 0, "")
+    assert row["timing"]["control_cpu_us"] > 0
+    assert row["timing"]["late"] == 0.0
+
+
+def test_a_failing_episode_is_a_row(scene):
+    """Stopped on its way by a load that no rod bears; and not even begun, for the reference is out of reach."""
+    stopped = run_episode(replace(scene, force=(0.0, 500.0)), scene.tuning, 0, EXACT)
+    assert "stopped at t =" in stopped["failure"]
+    assert stopped["rms_mm"] > 0
+    unreachable = run_episode(replace(scene, trajectory=Hold((0.0, 0.45))), scene.tuning, 0, EXACT)
+    assert "UnreachableError: reference at t = 0.000 s" in unreachable["failure"]
+    assert unreachable["rms_mm"] is None
+    assert unreachable["timing"]["control_cpu_us"] is None
+    assert set(stopped) == set(unreachable)
+
+
+def test_straying_is_a_failure_after_the_start_up(scene, monkeypatch):
+    monkeypatch.setattr(episodes, "make_controller", lambda *_, **__: HoldMotors(2))
+    far = replace(scene, duration=1.3)
+    row = run_episode(far, scene.tuning, 0, EXACT)
+    assert row["failure"].startswith("strayed ")
+    assert "at t = 1." in row["failure"]
+    assert row["max_mm"] > 1e3 * ALLOWED_ERROR
+    # Within the first second the tip may be anywhere, but not at the end.
+    brief = run_episode(replace(scene, duration=0.9), scene.tuning, 0, EXACT)
+    assert brief["final_error_mm"] > 1e3 * ALLOWED_ERROR
+    assert f"strayed {brief['final_error_mm']:.1f} mm" in brief["failure"]
+    near = run_episode(replace(scene, duration=0.2), scene.tuning, 0, EXACT)
+    assert near["failure"] == ""
+
+
+def test_broken_limits_are_a_failure(scene, monkeypatch):
+    class Racing(HoldMotors):
+        def step(self, k, x):
+            return replace(super().step(k, x), u=np.array([7.0, 0.0]) if k == 3 else np.zeros(2))
+
+    monkeypatch.setattr(episodes, "make_controller", lambda *_, **__: Racing(2))
+    row = run_episode(scene, scene.tuning, 0, EXACT)
+    assert row["failure"] == "limits violated in 2 of 30 periods"  # up and down again
+    assert row["limit_violations"] == 2
+
+
+def test_an_interrupt_is_no_failing_episode(scene, monkeypatch):
+    class Interrupted(HoldMotors):
+        def step(self, k, x):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(episodes, "make_controller", lambda *_, **__: Interrupted(2))
+    with pytest.raises(KeyboardInterrupt):
+        run_episode(scene, scene.tuning, 0)
+
+
+def test_a_deadline_does_not_make_an_episode_depend_on_the_machine(scene):
+    late = run_episode(replace(scene, deadline=0.0, duration=0.1), scene.tuning, 2)
+    in_time = run_episode(replace(scene, duration=0.1), scene.tuning, 2)
+    assert repeatable(late) == repeatable(in_time)
