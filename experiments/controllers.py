@@ -1,7 +1,7 @@
 """How good is the linear MPC? Every controller in every case, error against time per step.
 
-From open loop to nonlinear MPC, and do-mpc where it is installed (extra "peers"), with the same weights, horizon,
-limits and estimates. (do-mpc has no observer here: it is given the true velocity, knows no load and no delay, and
+From open loop to nonlinear MPC, and do-mpc where it is installed (extra "peers"), with the same weights (but the
+frozen MPC, which weights its inputs ten times less), horizon, limits and estimates. (do-mpc has no observer here: it is given the true velocity, knows no load and no delay, and
 raises where it fails.) In the cases with something off by 20 % the controllers believe in the nominal robot. Failures
 are rows.
 
@@ -35,8 +35,8 @@ CONTROLLERS = {
     "open loop": ("open_loop", GREY, "x"),
     "PD": ("pd", ORANGE, "v"),
     "LQR": ("lqr", SKY, "^"),
-    "linear MPC": ("default", BLUE, "o"),
-    "real-time iteration": ("real_time_iteration", GREEN, "s"),
+    "linear MPC, frozen": ("frozen", BLUE, "o"),
+    "linear MPC, along the plan": ("default", GREEN, "s"),
     "nonlinear MPC": ("nonlinear", RED, "D"),
     "do-mpc": ("nonlinear", PURPLE, "P"),
 }
