@@ -31,6 +31,8 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/basins.py --seeds 3 --out results/basins
 	cp results/basins/*.png docs/
 	$(BIN)/python experiments/linear_validity.py --out docs
+	$(BIN)/python experiments/monte_carlo.py --episodes 500 --out results/monte_carlo/figure
+	cp results/monte_carlo/figure/monte_carlo.png docs/
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
 	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
 
