@@ -26,6 +26,7 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/equilibria.py --out docs
 	$(BIN)/python experiments/time_step_limits.py --out docs
 	$(BIN)/python experiments/snap.py --out docs
+	$(BIN)/python experiments/rod_inertia.py --out docs
 	$(BIN)/python experiments/workspace.py --out results/workspace
 	cp results/workspace/*.png docs/
 	$(BIN)/python experiments/basins.py --seeds 3 --out results/basins
@@ -33,6 +34,9 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/linear_validity.py --out docs
 	$(BIN)/python experiments/monte_carlo.py --episodes 500 --out results/monte_carlo/figure
 	cp results/monte_carlo/figure/monte_carlo.png docs/
+	$(BIN)/python experiments/fold_guard.py --out results/fold_guard
+	$(BIN)/python experiments/controllers.py --out results/controllers
+	cp results/fold_guard/*.png results/controllers/*.png docs/
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
 	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
 

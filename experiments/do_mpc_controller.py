@@ -111,6 +111,7 @@ class DoMPC:
         # What it would store of every step is of no use here.
         settings.store_lagr_multiplier, settings.store_solver_stats = False, []
         settings.supress_ipopt_output()
+        settings.nlpsol_opts["show_eval_warnings"] = False  # of trial points where the model is NaN
         settings.nlpsol_opts["ipopt.bound_relax_factor"] = 0.0  # limits are hard here
         error = model.x.cat - model.tvp["state"]
         effort = model.u["rate"] - model.tvp["input"]

@@ -108,6 +108,13 @@ def test_a_shorter_period_does_not_make_the_bus_faster(scene, period, delay):
     assert run.scene.period == (period or scene.period)
 
 
+def test_only_rk4_is_replaced(scene):
+    """The paper's Euler is there for its own sake, and distributed rods move by an integrator of their own."""
+    for integrator, lighter in (("rk4", "velocity_verlet"), ("semi_implicit_euler",) * 2, ("gauss",) * 2):
+        given = replace(scene, plant=replace(scene.plant, integrator=integrator))
+        assert episodes.lighter(given) == replace(given, plant=replace(given.plant, integrator=lighter))
+
+
 def test_threads_take_turns(scene, monkeypatch):
     """The rods' graphs of a process share their memory."""
     inside, most = [], []

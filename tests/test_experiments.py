@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from experiments import basins
+from experiments import basins, rod_inertia
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +48,13 @@ def test_basins_half_size():
     assert basins.half_size(sizes, counts) == (pytest.approx(0.1), "")
     assert basins.half_size(sizes[:1], counts[:, :, :1]) == (0.01, ">")
     assert basins.half_size(sizes[2:], counts[:, :, 2:]) == (1.0, "<")
+
+
+def test_rod_inertia_ladder(pair):
+    """Each rung is an order of magnitude better than the one before, and the yardstick is known better than all."""
+    rows = rod_inertia.compare(pair, "displaced", 1.0, rod_inertia.QUICK_DURATION)
+    errors = {row["inertia"]: row["error_mm"] for row in rows}
+    assert errors["none"] > 0.5
+    assert errors["constant"] < 0.2 * errors["none"]
+    assert errors["condensed"] < min(0.02 * errors["constant"], 5e-3)
+    assert errors["full"] < 0.1 * errors["condensed"]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -12,6 +14,10 @@ def state(pose, velocity=(0.05, -0.1)):
     return np.concatenate([pose.p, velocity, pose.q])
 
 
+def heavier(robot, times):
+    return replace(robot, rods=tuple(replace(rod, line_density=times * rod.line_density) for rod in robot.rods))
+
+
 @pytest.mark.parametrize("method", ["closed_form", "multiple_shooting"])
 def test_jacobians_against_central_differences(pair, poses, method):
     """The error falls with the square of the step, then rises with rounding; its floor is below 1e-7."""
@@ -24,24 +30,30 @@ def test_jacobians_against_central_differences(pair, poses, method):
         assert errors[0] > 10 * errors.min()  # rounding
 
 
+@pytest.mark.parametrize("inertia", ["none", "constant"])
 @pytest.mark.parametrize("dt", [1e-3, 1e-2, 1e-1, 0.3])
-def test_discretisation_is_exact(pair, poses, dt):
-    """Against SciPy's matrix exponential of the whole affine system."""
-    plant = Plant(pair)
+def test_discretisation_is_exact(pair, poses, dt, inertia):
+    """Against SciPy's matrix exponential of the whole affine system, impulses of the rates at its ends."""
+    robot = heavier(pair, 20.0)
+    plant = Plant(robot, inertia=inertia)
     for pose in poses:
         x, f_ext = state(pose), np.array([0.3, -0.2])
         plant.reset(x, pose)
         model = linearise(plant, x, (0.0, 0.0), dt, f_ext)
         eq = plant.equilibrium(x)
-        m, n = pair.tip_mass, 2
+        mass, n = plant.mass(x[:2], x[4:])[0], 2
+        inverse = np.linalg.inv(mass[:2, :2])
         whole = np.zeros((4 + 2 * n + 1, 4 + 2 * n + 1))
         whole[0:2, 2:4] = np.eye(2)
-        whole[2:4, 0:2] = -eq.dforce_dp / m
-        whole[2:4, 2:4] = -pair.drag / m * np.eye(2)
-        whole[2:4, 4:6] = -eq.dforce_dq / m
+        whole[2:4, 0:2] = -inverse @ eq.dforce_dp
+        whole[2:4, 2:4] = -pair.drag * inverse
+        whole[2:4, 4:6] = -inverse @ eq.dforce_dq
         whole[4:6, 6:8] = np.eye(2)
-        whole[2:4, 8] = (f_ext - eq.force + eq.dforce_dp @ x[:2] + eq.dforce_dq @ x[4:]) / m
-        exact = expm(dt * whole)
+        whole[2:4, 8] = inverse @ (f_ext - eq.force + eq.dforce_dp @ x[:2] + eq.dforce_dq @ x[4:])
+        start, stop = np.eye(9), np.eye(9)
+        start[2:4, 6:8] = -inverse @ mass[:2, 2:]
+        stop[2:4, 6:8] = -start[2:4, 6:8]
+        exact = stop @ expm(dt * whole) @ start
         assert model.A == pytest.approx(exact[:6, :6], rel=1e-8, abs=1e-8)
         assert model.B == pytest.approx(exact[:6, 6:8], rel=1e-8, abs=1e-8)
         assert model.c == pytest.approx(exact[:6, 8], rel=1e-8, abs=1e-8)
@@ -64,6 +76,53 @@ def test_prediction_error_is_of_second_order(pair, centre):
         errors.append(np.linalg.norm(predicted - y))
     rates = np.log2(np.array(errors[:-1]) / errors[1:])
     assert rates == pytest.approx([2.0, 2.0], abs=0.2)
+
+
+def differences(plant, pose, x, u):
+    """A and B of one step of the plant, by central differences."""
+
+    def step(y, w):
+        plant.reset(x, pose)  # which is where the inertia is constant
+        return plant.step(y, w)
+
+    a = [(step(x + h, u) - step(x - h, u)) / 2e-4 for h in 1e-4 * np.eye(6)]
+    b = [(step(x, u + h) - step(x, u - h)) / 2e-4 for h in 1e-4 * np.eye(2)]
+    return np.array(a).T, np.array(b).T
+
+
+@pytest.mark.parametrize("inertia", ["none", "constant", "condensed"])
+def test_inertia_against_differences_of_a_step(pair, poses, inertia):
+    """From rest, where the products of velocities that are left out vanish; out of balance, with heavy rods."""
+    robot, dt = heavier(pair, 10.0), 5e-4
+    for pose in poses:
+        x, u = state(pose, (0.0, 0.0)), np.zeros(2)
+        plant = Plant(robot, inertia=inertia, integrator="rk4", dt=dt)
+        plant.reset(x, pose)
+        model = linearise(plant, x, u, dt)
+        a, b = differences(plant, pose, x, u)
+        size = np.abs(a - np.eye(6))[2:4, [0, 1, 4, 5]].max()
+        assert np.abs(model.A - a)[2:4].max() < 1e-3 * size
+        assert np.abs(model.A - a)[[0, 1, 4, 5]].max() < 1e-3 * dt
+        assert np.abs(model.B - b)[:2].max() < 1e-3 * np.abs(b[:2]).max()
+        assert np.abs(model.B - b)[2:4].max() < 1e-3 * dt * size
+
+
+def test_what_the_linear_model_leaves_out_of_the_inertia(pair, centre):
+    """In motion, over a control period: as little as F's own curvature, a hundredth of the inertia itself."""
+    x, u = state(centre, (0.3, -0.2)), np.array([2.0, -1.5])
+    plant = Plant(pair, inertia="condensed", integrator="rk4", dt=1e-3)
+    errors = {}
+    for inertia in ("condensed", "none"):
+        model_plant = Plant(pair, inertia=inertia)
+        model_plant.reset(x, centre)
+        predicted = linearise(model_plant, x, u, 0.01)(x, u)
+        plant.reset(x, centre)
+        y = x
+        for _ in range(10):
+            y = plant.step(y, u)
+        errors[inertia] = np.linalg.norm((predicted - y)[:2])
+    assert errors["condensed"] < 2e-7
+    assert errors["none"] > 1e-6
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0, np.nan, np.inf, 100.0])

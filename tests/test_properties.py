@@ -204,9 +204,16 @@ def test_robot_files_are_read_or_refused(tmp_path_factory, key, value):
 
 
 @cases(1000)
-@given(tips, st.tuples(tip, tip), angles, st.tuples(tip, tip), st.sampled_from([1e-4, 1e-3, 0.05]))
-def test_plant_and_linear_model(p, v, q, u, dt):
-    plant = Plant(PAIR, dt=dt)
+@given(
+    tips,
+    st.tuples(tip, tip),
+    angles,
+    st.tuples(tip, tip),
+    st.sampled_from([1e-4, 1e-3, 0.05]),
+    st.sampled_from(["none", "constant", "condensed"]),
+)
+def test_plant_and_linear_model(p, v, q, u, dt, inertia):
+    plant = Plant(PAIR, inertia=inertia, dt=dt)
     x = [*p, *v, *q]
     if checked(lambda: plant.reset(x) or True) is None:
         return

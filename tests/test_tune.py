@@ -173,7 +173,7 @@ def test_a_written_tuning_reads_back(tmp_path):
     tuning = load_tuning(CONTROLLERS / "default.toml")
     path = tmp_path / "new" / "mine.toml"
     model = replace(tuning.model, linearise="along_plan", predict_delay=False, segments=4, method="multiple_shooting",
-                    scheme="rk4", steps=2)  # fmt: skip
+                    scheme="rk4", steps=2, inertia="constant")  # fmt: skip
     observer = replace(tuning.observer, tip_noise=2e-5, force_walk=3e-5, force_noise=0.5)
     full = replace(tuning, name="mine", period=0.005, velocity_weight=1.23e-7, angle_weight=0.5, horizon=30,
                    tolerance=1e-9, fallback="raise", model=model, observer=observer)  # fmt: skip

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 import control
 import numpy as np
 
-from ..errors import InfeasibleError, checked_vector
+from ..errors import InfeasibleError, checked_array, checked_vector
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
-from .limited_qp import Limited, LimitedQP, active_kinds
-from .osqp_solver import QPSolver
 from .plan import Plan
-from .qp import QuadraticProgram, Reference, Rollout, build_qp, constraint_matrix, model_sequence
+from .qp import Reference, assemble, model_sequence
 from .tuning import Limits, Tuning
-
-_FEWEST_ITERATIONS = 10  # with which OSQP is tried at all
+from .workspace import Workspace
 
 
 class LinearMPC:
@@ -38,7 +34,7 @@ class LinearMPC:
     def __init__(self, tuning: Tuning, limits: Limits) -> None:
         self.tuning = tuning
         self.limits = limits
-        self._workspace: _Workspace | None = None
+        self._workspace: Workspace | None = None
         self._terminal_weight: np.ndarray | None = None
         self._gain: np.ndarray | None = None
         self._last: Plan | None = None
@@ -59,7 +55,7 @@ class LinearMPC:
         self._gain, self._terminal_weight = riccati(model, self.tuning)
         self._dt = model.dt
         if self._workspace is None:
-            self._workspace = _Workspace(self.tuning, model)
+            self._workspace = Workspace(self.tuning, model)
         for kinds in ((), *combinations):
             self._workspace.limited(kinds)
 
@@ -98,12 +94,16 @@ class LinearMPC:
         first = sequence[0]
         n_states, n = first.B.shape
         x, u_previous = checked_vector("x", x, n_states), checked_vector("u_previous", u_previous, n)
+        horizon = self.tuning.horizon
+        wanted = checked_array("reference.states", reference.states, (horizon, n_states))
+        feed_forward = checked_array("reference.inputs", reference.inputs, (horizon, n))
         if self._terminal_weight is None or self._workspace is None:
             self.prepare(first)
         assert self._terminal_weight is not None
         assert self._workspace is not None
-        self._workspace.require(first)
-        qp = build_qp(x, models, reference, u_previous, self.tuning, self.limits, self._terminal_weight)
+        self._workspace.require(sequence)
+        window = Reference(wanted, feed_forward)
+        qp = assemble(x, sequence, window, u_previous, self.tuning, self.limits, self._terminal_weight)
         warm = None if self._last is None else _shifted(self._last.inputs).ravel()
         updated = time.perf_counter()
         status, fallback = "solved", None
@@ -125,7 +125,7 @@ class LinearMPC:
         inside = inputs[0] if fallback else self.limits.within_stops(inputs[0], x[4:], first.dt)
         first_rates = self.limits.clipped(inside, u_previous)
         states = answer.states
-        if states is None or not np.array_equal(inputs[0], first_rates):
+        if states is None or inputs[0].tolist() != first_rates.tolist():
             inputs[0] = first_rates
             states = self._workspace.rollout(x, sequence, inputs)
         self._age = 0
@@ -142,6 +142,7 @@ class LinearMPC:
             dual_residual=answer.solution.dual_residual,
             update_time=updated - began,
             solve_time=solved - updated,
+            solver_time=answer.solution.run_time,
         )
         return self._last
 
@@ -180,114 +181,6 @@ class LinearMPC:
         active = () if np.array_equal(wanted, asked) else self.limits.met_by(wanted, u_previous)
         self._last = Plan(inputs, states, models, status, fallback, active)
         return self._last
-
-
-class _Workspace:
-    """Solvers for the same problem: one knows the limits on the rates alone, the others all of them."""
-
-    def __init__(self, tuning: Tuning, model: LinearModel) -> None:
-        self.n, self.dt = model.B.shape[1], model.dt
-        self._tuning = tuning
-        rates = constraint_matrix(tuning.horizon, self.n)[: 2 * tuning.horizon * self.n].tocsc()
-        self._rates_only = QPSolver(rates, tuning.tolerance, tuning.max_iterations)
-        self._groups = np.repeat(["rate", "rate change"], tuning.horizon * self.n)
-        self._limited: dict[tuple[str, ...], LimitedQP] = {}
-        self._limits_matter = False  # in the last plan, beside those on the rates
-        self._spent = 0  # iterations in this control step
-        self.rollout = Rollout(tuning.horizon, self.n)
-
-    def limited(self, kinds: tuple[str, ...]) -> LimitedQP:
-        """Solver for limits of these kinds, made once."""
-        if kinds not in self._limited:
-            self._limited[kinds] = LimitedQP(self._tuning, self.n, self.dt, kinds)
-        return self._limited[kinds]
-
-    def reset(self) -> None:
-        """Start afresh."""
-        self._limits_matter = False
-        self._rates_only.reset()
-        for solver in self._limited.values():
-            solver.reset()
-
-    def require(self, model: LinearModel) -> None:
-        """Raise if the model is for another robot or period."""
-        if (model.B.shape[1], model.dt) != (self.n, self.dt):
-            raise ValueError(
-                f"model has {model.B.shape[1]} motors and dt = {model.dt} s, but this controller was built for "
-                f"{self.n} and {self.dt} s; make a new one"
-            )
-
-    def solve(
-        self,
-        qp: QuadraticProgram,
-        x: np.ndarray,
-        models: Sequence[LinearModel],
-        pose_limits: LinearLimits | None,
-        limits: Limits,
-        warm: np.ndarray | None,
-    ) -> Limited:
-        """Solve with the rates' rows alone; where that breaks another limit, or fails, with all of them.
-
-        An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half;
-        its multipliers are those of the rates' rows, the others being zero. While other limits shape the plans, the
-        whole is solved at once.
-        """
-        self._spent = 0
-        if not self._limits_matter:
-            n_rates = self._rates_only.m
-            try:
-                self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
-                if warm is not None:
-                    self._rates_only.warm_start(warm)
-                solution = self._rates_only.solve()
-            except InfeasibleError as error:
-                self._spent = error.details.get("iterations", 0)
-            else:
-                states = self.rollout(x, models, solution.x)
-                angles = states[1:, 4:]
-                broken = max(float((limits.angle_lower - angles).max()), float((angles - limits.angle_upper).max()))
-                if pose_limits is not None:
-                    rows = states[1:] @ pose_limits.C.T
-                    broken = max(
-                        broken, float((pose_limits.lower - rows).max()), float((rows - pose_limits.upper).max())
-                    )
-                if broken <= self._tuning.tolerance * self.dt:
-                    return Limited(solution.x, states, {}, active_kinds(solution.y, self._groups), solution)
-                self._spent, warm = solution.iterations, solution.x
-        return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
-
-    def soften(
-        self, qp: QuadraticProgram, x: np.ndarray, models: Sequence[LinearModel], pose_limits: LinearLimits | None
-    ) -> Limited:
-        """Solve with the angle limits softened too, with the iterations that `solve` has left."""
-        return self._solve_whole(qp, x, models, pose_limits, None, soft_angles=True)
-
-    def _solve_whole(
-        self,
-        qp: QuadraticProgram,
-        x: np.ndarray,
-        models: Sequence[LinearModel],
-        pose_limits: LinearLimits | None,
-        warm: np.ndarray | None,
-        soft_angles: bool,
-    ) -> Limited:
-        kinds = () if pose_limits is None else pose_limits.kinds
-        left = self._tuning.max_iterations - self._spent
-        if left < _FEWEST_ITERATIONS:
-            raise InfeasibleError(
-                f"the {self._tuning.max_iterations} iterations allowed are spent", status="maximum iterations reached",
-                iterations=self._spent, limit=None,
-            )  # fmt: skip
-        try:
-            answer = self.limited(kinds).solve(
-                qp, x, models, pose_limits, soft_angles=soft_angles, warm=warm, most=left
-            )
-        except InfeasibleError as error:
-            self._spent += error.details.get("iterations", 0)
-            raise
-        self._spent += answer.solution.iterations
-        self._limits_matter = not set(answer.active) <= {"rate", "rate change"}
-        return replace(answer, solution=replace(answer.solution, iterations=self._spent))
 
 
 def terminal_weight(model: LinearModel, tuning: Tuning) -> np.ndarray:

@@ -32,6 +32,8 @@ class Solution:
     y : ndarray, shape (m,)
         Multipliers, positive at upper bounds.
     iterations : int
+    run_time : float
+        Inside OSQP, updates of its data included [s].
     primal_residual, dual_residual : float
         Largest violation of l <= A x <= u, and largest entry of P x + q + A'y, computed here from the data.
     """
@@ -39,6 +41,7 @@ class Solution:
     x: np.ndarray
     y: np.ndarray
     iterations: int
+    run_time: float
     primal_residual: float
     dual_residual: float
 
@@ -197,11 +200,12 @@ class QPSolver:
                 "relax the limits, shorten the horizon or raise max_iterations",
                 status=status,
                 iterations=iterations,
+                run_time=float(info.run_time),
                 limit=limit,
             )
         x, y = np.array(core.solution.x), np.array(core.solution.y)
         primal, dual = self._residuals(x, y, *self._data)
-        return Solution(x, y, int(info.iter), primal, dual)
+        return Solution(x, y, int(info.iter), float(info.run_time), primal, dual)
 
     def _residuals(
         self,

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..frozen import freeze
 from ..linearisation.linear_model import LinearModel
 
 # From the best answer to the last resort.
@@ -38,8 +37,8 @@ class Plan:
         Of the solver.
     primal_residual, dual_residual : float
         Recomputed from the problem's data; NaN if unsolved.
-    update_time, solve_time : float
-        Assembling the problem, and handing it over and solving it [s].
+    update_time, solve_time, solver_time : float
+        Assembling the problem; handing it over and solving it; of that, inside the solver's own code [s].
     """
 
     inputs: np.ndarray
@@ -54,6 +53,9 @@ class Plan:
     dual_residual: float = float("nan")
     update_time: float = 0.0
     solve_time: float = 0.0
+    solver_time: float = 0.0
 
     def __post_init__(self) -> None:
-        freeze(self)
+        self.inputs.flags.writeable = False
+        if self.states is not None:
+            self.states.flags.writeable = False

@@ -87,7 +87,6 @@ def build_qp(
     terminal_weight : ndarray, shape (4 + n, 4 + n)
         T, for instance the cost-to-go of the LQR.
     """
-    single = isinstance(models, LinearModel)
     sequence = model_sequence(models, tuning.horizon)
     n_states, n = sequence[0].B.shape
     if any(model.dt != sequence[0].dt for model in sequence):
@@ -98,17 +97,32 @@ def build_qp(
     terminal_weight = checked_array("terminal_weight", terminal_weight, (n_states, n_states))
     if len(limits.angle_lower) != n:
         raise ValueError(f"limits are for {len(limits.angle_lower)} motors, the model has {n}")
+    return assemble(x, sequence, Reference(wanted, feed_forward), u_previous, tuning, limits, terminal_weight)
+
+
+def assemble(
+    x: np.ndarray,
+    models: Sequence[LinearModel],
+    reference: Reference,
+    u_previous: np.ndarray,
+    tuning: Tuning,
+    limits: Limits,
+    terminal_weight: np.ndarray,
+) -> QuadraticProgram:
+    """`build_qp` for arguments that are known to be right; one model or N of them."""
+    n_states, n = models[0].B.shape
+    single = len(models) == 1
     function = _condensing(
         tuning.horizon, n, single, tuning.velocity_weight > 0, tuning.angle_weight > 0, threading.get_ident()
     )
     a, b, c, start, states, inputs, previous, weights, terminal, bounds, dt = function.inputs
-    for k, model in enumerate(sequence):
+    for k, model in enumerate(models):
         a[:, k * n_states : (k + 1) * n_states] = model.A
         b[:, k * n : (k + 1) * n] = model.B
         c[k * n_states : (k + 1) * n_states] = model.c
     start[:] = x
-    states.reshape((n_states, -1), order="F")[:] = wanted.T
-    inputs.reshape((n, -1), order="F")[:] = feed_forward.T
+    states.reshape((n_states, -1), order="F")[:] = reference.states.T
+    inputs.reshape((n, -1), order="F")[:] = reference.inputs.T
     previous[:] = u_previous
     weights[:] = tuning.position_weight, tuning.velocity_weight, tuning.angle_weight, tuning.input_weight
     terminal[:] = terminal_weight
@@ -116,7 +130,7 @@ def build_qp(
     bounds[:, 1] = limits.rate_change
     bounds[:, 2] = limits.angle_lower
     bounds[:, 3] = limits.angle_upper
-    dt[0] = sequence[0].dt
+    dt[0] = models[0].dt
     function()
     p, q, lower, upper = function.outputs
     return QuadraticProgram(p.copy(), q.copy(), constraint_matrix(tuning.horizon, n),

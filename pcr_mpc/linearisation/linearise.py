@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from ..buffered import BufferedFunction
 from ..errors import checked_number, checked_vector
@@ -25,6 +25,12 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     The rods' force is replaced by F + K dp + G dq with K = dF/dp, G = dF/dq from implicit differentiation
     of the statics; the resulting affine system m p'' + c p' = -F - K dp - G dq + f_ext, q' = u is
     discretised exactly for inputs held over dt (matrix exponential, not an integrator's step).
+
+    Where the plant's rods have inertia, M_pp stands for m, and its change with the pose times the acceleration
+    at x goes into K and G. The rates act through M_pq as impulses at both ends of the period (see `Plant`), which
+    makes the tip move with v - M_pp^-1 M_pq u. Left out are the Coriolis terms and the change of M_pp^-1 M_pq u
+    with the pose, products of velocities: on the default robot at 0.3 m/s and 2 rad/s they are worth 5e-8 m in
+    10 ms, as much as the curvature of F; leaving out the rods' inertia as a whole costs 1e-5 m.
 
     Parameters
     ----------
@@ -51,8 +57,9 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     f_ext = checked_vector("f_ext", f_ext, 2)
     dt = checked_number("dt", dt, minimum=1e-12)
     force, k, g = plant.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
+    inertia, slopes = plant.mass(x[:2], x[4:])
     mass, drag = plant.robot.tip_mass, plant.robot.drag
-    stiffness, damping = float(np.abs(k).max()) * dt * dt / mass, drag * dt / mass
+    stiffness, damping = max(map(abs, k.ravel().tolist())) * dt * dt / mass, drag * dt / mass
     if not (stiffness <= _STIFFEST and damping * damping <= _STIFFEST):
         raise ValueError(
             f"dt = {dt} s is too long for the stiffness at p = {x[:2]} m or for the drag: K dt^2/m is {stiffness:.3g} "
@@ -64,30 +71,42 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     function.inputs[1][:] = g
     function.inputs[2][:] = force - f_ext
     function.inputs[3][:] = x
-    function.inputs[4][:] = mass, drag, dt
+    function.inputs[4][:] = drag, dt
+    function.inputs[5][:], function.inputs[6][:] = inertia, slopes
     function()
-    a, b, c, e = (output.copy() for output in function.outputs)
-    if not np.isfinite(c).all():
+    packed = function.outputs[0].copy()
+    n = plant.n_states
+    a, c = packed[: n * n].reshape(n, n, order="F"), packed[n * n : n * (n + 1)]
+    b, e = packed[n * (n + 1) : -2 * n].reshape(n, -1, order="F"), packed[-2 * n :].reshape(n, 2, order="F")
+    if not all(map(math.isfinite, c.tolist())):
         raise ValueError(f"the linear model at x = {x} with external force {f_ext} N is not finite")
     return LinearModel(a, b, c, e, dt, f_ext.copy())
 
 
 @lru_cache(maxsize=32)
 def _discretisation(n: int, thread: int) -> BufferedFunction:
-    """Exact discretisation as one graph: (K, G, F - F_ext, x, [m, c, dt]) -> (A, B, c, E)."""
+    """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q)) -> [A, c, B, E],
+    column by column in one vector."""
     k, g, force = ca.SX.sym("K", 2, 2), ca.SX.sym("G", 2, n), ca.SX.sym("F", 2)
-    x, parameters = ca.SX.sym("x", 4 + n), ca.SX.sym("parameters", 3)
-    mass, drag, dt = ca.vertsplit(parameters)
-    p, q = x[:2], x[4:]
+    x, parameters = ca.SX.sym("x", 4 + n), ca.SX.sym("parameters", 2)
+    mass, slopes = ca.SX.sym("M", 2 + n, 2 + n), ca.SX.sym("dM", (2 + n) ** 2, 2 + n)
+    drag, dt = ca.vertsplit(parameters)
+    p, v, q = x[:2], x[2:4], x[4:]
+
+    inverse = ca.inv(mass[:2, :2])
+    coupling = inverse @ mass[:2, 2:]
+    acceleration = -inverse @ (force + drag * v)
+    by_pose = ca.horzcat(*(ca.reshape(slopes[:, j], 2 + n, 2 + n)[:2, :2] @ acceleration for j in range(2 + n)))
+    k_effective, g_effective = k + by_pose[:, :2], g + by_pose[:, 2:]
 
     # In y = [dp, dv dt] and tau = t/dt the motion is dy/dtau = a y + [0, w0 + w1 tau], where the force at the
     # start gives w0 and the motors' rates w1; every entry is dimensionless. With phi_1 = int exp(a s) ds and
     # phi_2 = int (1 - s) exp(a s) ds over [0, 1], y(1) = exp(a) y(0) + phi_1 [0, w0] + phi_2 [0, w1].
-    scale = dt * dt / mass
+    scale = dt * dt * inverse
     a = ca.SX(4, 4)
     a[0:2, 2:4] = ca.SX.eye(2)
-    a[2:4, 0:2] = -scale * k
-    a[2:4, 2:4] = -(dt * drag / mass) * ca.SX.eye(2)
+    a[2:4, 0:2] = -scale @ k_effective
+    a[2:4, 2:4] = -dt * drag * inverse
 
     # Taylor series over a fraction of the period, then doubled; of phi_1, phi_2 only the force's columns.
     fraction = 1.0 / 2**_SQUARINGS
@@ -105,15 +124,18 @@ def _discretisation(n: int, thread: int) -> BufferedFunction:
         fraction *= 2
 
     units = ca.vertcat(1, 1, 1 / dt, 1 / dt)
-    by_angle = -scale * ca.mtimes(phi_1, g)
-    by_rate = -scale * dt * ca.mtimes(phi_2, g)
-    top = ca.horzcat(exponential @ ca.diag(1 / units), by_angle)
-    a_matrix = ca.vertcat(ca.diag(units) @ top, ca.horzcat(ca.SX(n, 4), ca.SX.eye(n)))
-    b_matrix = ca.vertcat(ca.diag(units) @ by_rate, dt * ca.SX.eye(n))
+    by_angle = -phi_1 @ scale @ g_effective
+    by_rate = -dt * phi_2 @ scale @ g_effective
+    top = ca.diag(units) @ exponential @ ca.diag(1 / units)
+    # The tip's own velocity while the motors turn is the state's less `coupling` u.
+    impulses = ca.vertcat(ca.SX(2, n), coupling) - top[:, 2:] @ coupling
+    a_matrix = ca.vertcat(ca.horzcat(top, ca.diag(units) @ by_angle), ca.horzcat(ca.SX(n, 4), ca.SX.eye(n)))
+    b_matrix = ca.vertcat(ca.diag(units) @ by_rate + impulses, dt * ca.SX.eye(n))
     # About x: y = x - x0, so that the constant is what is left after A x0.
-    state = ca.vertcat(0, 0, dt * x[2], dt * x[3])
-    moved = exponential @ state - scale * ca.mtimes(phi_1, force)
+    state = ca.vertcat(0, 0, dt * v)
+    moved = exponential @ state - phi_1 @ scale @ force
     c_vector = ca.vertcat(p + moved[:2], moved[2:] / dt, q) - a_matrix @ x
-    e_matrix = ca.vertcat(ca.diag(units) @ (scale * phi_1), ca.SX(n, 2))
-    results = [a_matrix, b_matrix, c_vector, e_matrix]
-    return BufferedFunction(ca.Function("discretise", [k, g, force, x, parameters], results, {"cse": True}))
+    e_matrix = ca.vertcat(ca.diag(units) @ phi_1 @ scale, ca.SX(n, 2))
+    results = [ca.vertcat(ca.vec(a_matrix), c_vector, ca.vec(b_matrix), ca.vec(e_matrix))]
+    arguments = [k, g, force, x, parameters, mass, slopes]
+    return BufferedFunction(ca.Function("discretise", arguments, results, {"cse": True}))

@@ -49,8 +49,9 @@ class Run:
         Commanded motor rates [rad/s].
     plant_time : ndarray, shape (K,)
         Wall time of each plant step [s].
-    control_time : ndarray, shape (M, 5)
-        Wall time of each control step: total, linearisation, QP update, QP solution; CPU time of its thread [s].
+    control_time : ndarray, shape (M, 6)
+        Wall time of each control step: total, linearisation, QP update, QP solution, of that inside the solver; and
+        CPU time of its thread [s].
     iterations : ndarray, shape (M,)
         Of the solver.
     active_limits : dict
@@ -146,11 +147,12 @@ class Run:
             "final_tip_m": self.x[-1, :2].tolist(),
             "plant_step_us": percentiles(1e6 * self.plant_time),
             "control_step_us": percentiles(1e6 * self.control_time[:, 0]),
-            "control_cpu_us": percentiles(1e6 * self.control_time[:, 4]),
+            "control_cpu_us": percentiles(1e6 * self.control_time[:, 5]),
             "control_parts_us": {
                 name: percentiles(1e6 * self.control_time[:, 1 + i])
-                for i, name in enumerate(("linearise", "update", "solve"))
+                for i, name in enumerate(("linearise", "update", "solve", "solver"))
             },
+            "solver_share": _share(self.control_time[:, 4], self.control_time[:, 0]),
             "plant_budget_us": 1e6 * self.dt,
             "control_budget_us": 1e6 * self.scene.period,
             "qp_iterations": {
@@ -202,6 +204,10 @@ def percentiles(values: np.ndarray) -> dict[str, float | None]:
         return dict.fromkeys(("p50", "p95", "p99", "max"))
     p50, p95, p99 = np.percentile(values, [50, 95, 99])
     return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(values.max())}
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> float | None:
+    return float(part.sum() / whole.sum()) if whole.sum() else None
 
 
 def _rms(values: np.ndarray) -> float:

@@ -14,6 +14,7 @@ from ..linearisation.pose_limits import PoseLimits
 from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import forward_statics, inverse_statics
+from ..plant.inertia import INERTIAS
 from ..plant.robot import Robot, load_robot
 from ..plant.rod import SCHEMES
 from ..plant.statics import METHODS
@@ -38,6 +39,7 @@ class PlantSettings:
     integrator: str
     dt: float
     on_snap: str
+    inertia: str = "none"
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,7 @@ class Scene:
             integrator=settings.integrator,
             dt=settings.dt,
             on_snap=settings.on_snap,
+            inertia=settings.inertia,
         )
 
 
@@ -193,10 +196,15 @@ def load_scene(path: str | Path) -> Scene:
                 segments=table.integer("segments", 8),
                 steps=table.integer("steps", 1),
                 scheme=table.text("scheme", "rk8", choices=tuple(SCHEMES)),
-                integrator=table.text("integrator", choices=tuple(INTEGRATORS)),
+                integrator=table.text("integrator", choices=(*INTEGRATORS, "gauss")),
                 dt=table.number("dt", above=0.0),
                 on_snap=table.text("on_snap", "raise", choices=ON_SNAP),
+                inertia=table.text("inertia", "none", choices=INERTIAS),
             )
+            if (plant.inertia == "full") != (plant.integrator == "gauss"):
+                raise table.fail("integrator", f"is {plant.integrator}: inertia 'full' needs 'gauss', and only it does")
+            if plant.inertia != "none" and plant.method != "closed_form":
+                raise table.fail("inertia", f"is {plant.inertia}, which needs method 'closed_form', not {plant.method}")
         with file.table("control") as control:
             period = control.number("period", above=0.0)
             tuning = control.text("tuning", None)

@@ -68,7 +68,7 @@ def simulate(
     states = np.empty((n_periods * per + 1, len(x)))
     inputs = np.empty((n_periods, n))
     plant_time = np.empty(n_periods * per)
-    control_time = np.zeros((n_periods, 5))
+    control_time = np.zeros((n_periods, 6))
     iterations = np.zeros(n_periods, dtype=int)
     active: Counter[str] = Counter()
     slack: dict[str, float] = {}
@@ -110,7 +110,7 @@ def simulate(
             began, began_cpu = time.perf_counter(), time.thread_time()
             decision = controller.step(k, measured)
             control_time[k, 0] = time.perf_counter() - began
-            control_time[k, 4] = time.thread_time() - began_cpu
+            control_time[k, 5] = time.thread_time() - began_cpu
             inputs[k] = decision.u
             decided = k + 1
             on_the_way.append(decision.u)
@@ -124,7 +124,7 @@ def simulate(
                 )
             if decision.plan is not None:
                 plan = decision.plan
-                control_time[k, 1:4] = decision.linearise_time, plan.update_time, plan.solve_time
+                control_time[k, 1:5] = decision.linearise_time, plan.update_time, plan.solve_time, plan.solver_time
                 iterations[k] = plan.iterations
                 active.update(plan.active)
                 slack |= {kind: max(amount, slack.get(kind, 0.0)) for kind, amount in plan.slack.items()}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import mul
+
 import numpy as np
 
 from ..errors import PCRError
@@ -42,12 +44,14 @@ class MotorTarget:
         except PCRError:
             return self._shift
         # The least motion: G'(G G')^-1, two by two however many motors there are.
-        (a, b), (_, d) = (g @ g.T).tolist()
+        first, second = g.tolist()
+        a, b, d = (sum(map(mul, one, other)) for one, other in ((first, first), (first, second), (second, second)))
         determinant = a * d - b * b
         if determinant < _SINGULAR * a * d:
             return self._shift
         x, y = (force - found).tolist()
-        step = np.array([d * x - b * y, a * y - b * x]) / determinant @ g
-        largest = max(map(abs, step.tolist()))
-        self._shift = self._shift + (step if largest <= _LARGEST_STEP else step * (_LARGEST_STEP / largest))
+        along, across = (d * x - b * y) / determinant, (a * y - b * x) / determinant
+        step = [along * one + across * other for one, other in zip(first, second, strict=True)]
+        largest = max(map(abs, step))
+        self._shift = self._shift + (1.0 if largest <= _LARGEST_STEP else _LARGEST_STEP / largest) * np.array(step)
         return self._shift

@@ -56,15 +56,18 @@ def time_scene(scene: Scene, steps: int = 2000, *, progress: bool = False) -> di
     if scene.trajectory is not None:
         controller.start(pose)
         states = run.x[:: run.steps_per_period]
-        parts = np.empty((len(run.u), 4))
+        parts = np.empty((len(run.u), 5))
         for k in range(len(run.u)):
             began = time.perf_counter()
             decision = controller.step(k, states[k])
             parts[k, 0] = time.perf_counter() - began
             assert decision.plan is not None
-            parts[k, 1:] = decision.linearise_time, decision.plan.update_time, decision.plan.solve_time
+            plan = decision.plan
+            parts[k, 1:] = decision.linearise_time, plan.update_time, plan.solve_time, plan.solver_time
         model = scene.tuning.model.method if scene.tuning else ""
-        for name, values in zip(("control step", "linearise", "QP update", "QP solve"), parts.T, strict=True):
+        for name, values in zip(
+            ("control step", "linearise", "QP update", "QP solve", "inside OSQP"), parts.T, strict=True
+        ):
             components.append(_component(name, model, values))
         components.append(_component("control step between plant steps", model, run.control_time[:, 0]))
     return {"scene": scene.name, "components": components, "machine": machine(), "versions": versions()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 
@@ -100,7 +101,7 @@ class TrackingController:
         period, observer = self._scene.period, self.observer
         force = np.zeros(2)
         if observer is not None:
-            if np.isfinite(x[:2]).all() and np.isfinite(x[4:]).all():
+            if all(map(math.isfinite, x[:2].tolist() + x[4:].tolist())):
                 observer.correct(x[:2], x[4:])
             x, force = observer.x, observer.force
         began = time.perf_counter()
@@ -162,7 +163,10 @@ class TrackingController:
 
     def _make_model(self) -> Plant:
         model = self._tuning.model
-        return Plant(self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme)
+        return Plant(
+            self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
+            inertia=model.inertia,
+        )  # fmt: skip
 
     def _make_law(self, pose: Equilibrium) -> Law:
         tuning, limits = self._tuning, motor_limits(self._scene.robot, self._scene.period)

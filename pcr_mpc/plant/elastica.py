@@ -29,7 +29,7 @@ _GENTLE = 2.0  # load below which steps are taken in the components of the force
 _ROUNDING = 1e-5
 
 
-def elliptic(u: Any, k: Any, k_prime: Any) -> tuple[Any, Any, Any, Any]:
+def elliptic(u: Any, k: Any, k_prime: Any, steps: int = _LANDEN_STEPS) -> tuple[Any, Any, Any, Any]:
     """Sn, cn, dn and D = k'^2 int nd^2 du by ascending Landen transformations, with a fixed number of operations.
 
     The modulus is driven to 1, where the functions are hyperbolic and D = 0, so that k' may be as small as it
@@ -37,7 +37,7 @@ def elliptic(u: Any, k: Any, k_prime: Any) -> tuple[Any, Any, Any, Any]:
     D = E(am u) - k^2 sn cd, DLMF 19.8.13 becomes a sum of positive terms: nothing cancels.
     """
     moduli, factor = [], ca.SX(1)
-    for _ in range(_LANDEN_STEPS):
+    for _ in range(steps):
         moduli.append((k, k_prime))
         factor *= (1 + k) / 2
         k, k_prime = 2 * ca.sqrt(k) / (1 + k), (k_prime / (1 + k)) ** 2

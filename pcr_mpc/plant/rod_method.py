@@ -128,16 +128,20 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     Returns
     -------
     casadi.Function
-        (p (2), q (n), unknowns (u, n), tangents (u, 3n), poses (3, n)) of the last pose ->
-        unknowns, tangents, poses, loads (3, n), load_tangents (3, 3n), scalars (5, n) of the new one;
-        verdict (5) = [largest residual, largest residual where the derivatives were taken, largest change of an
-        unknown of the branch beyond the prediction, number of conjugate points, drift of the invariant];
-        force (2) [N]; K (2, 2) [N/m]; G (2, n) [N/rad].
+        ([p, q] (2 + n), start) -> record, verdict, result, each a vector in one piece, for copying many small arrays
+        costs as much as the arithmetic. The record of a pose holds, column by column, unknowns (u, n), tangents
+        (u, 3n), poses (3, n), loads (3, n), load_tangents (3, 3n), scalars (5, n), of which the first three are the
+        start of the next (see `RobotState`). Verdict (5) = [largest residual, largest residual where the derivatives
+        were taken, largest change of an unknown of the branch beyond the prediction, number of conjugate points, drift
+        of the invariant]; result (6 + 2n) = force (2) [N], K (2, 2) [N/m], G (2, n) [N/rad].
     """
     n, width = robot.n_rods, method.newton.size1_in(0)
-    p, q = ca.MX.sym("p", 2), ca.MX.sym("q", n)
-    unknowns, tangents = ca.MX.sym("unknowns", width, n), ca.MX.sym("tangents", width, 3 * n)
-    poses = ca.MX.sym("poses", 3, n)
+    target, start_record = ca.MX.sym("target", 2 + n), ca.MX.sym("start", (4 * width + 3) * n)
+    p, q = target[:2], target[2:]
+    blocks = ca.vertsplit(start_record, [0, width * n, 4 * width * n, (4 * width + 3) * n])
+    unknowns, tangents, poses = (
+        ca.reshape(block, -1, columns) for block, columns in zip(blocks, (n, 3 * n, n), strict=True)
+    )
     branch = list(range(width))[method.branch]
     columns: dict[str, list[Any]] = {name: [] for name in ("u", "t", "pose", "loads", "load_t", "scalars")}
     residuals, roughest, changes = [], [], []
@@ -163,7 +167,8 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     # Sums, not maxima, of what may be NaN: fmax would drop it.
     drift = sum(ca.fabs(scalars[4]) for scalars in columns["scalars"])
     verdict = ca.vertcat(sum(residuals), sum(roughest), sum(changes), conjugate_points, drift)
-    results = [*(ca.horzcat(*blocks) for blocks in columns.values()), verdict, force, k, ca.horzcat(*g)]
-    function = ca.Function("warm_step", [p, q, unknowns, tangents, poses], results)
+    record = ca.vertcat(*(ca.vec(ca.horzcat(*found)) for found in columns.values()))
+    result = ca.vertcat(force, ca.vec(k), ca.vec(ca.horzcat(*g)))
+    function = ca.Function("warm_step", [target, start_record], [record, verdict, result])
     small = method.newton.n_instructions() <= _INLINED_INSTRUCTIONS
     return function.expand("warm_step", {"cse": True}) if small else function

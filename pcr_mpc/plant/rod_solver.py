@@ -138,13 +138,12 @@ class RodSolver:
         # Where rough derivatives will do, one Newton iteration usually does.
         rough = derivatives is not None and derivatives >= _ROUGH
         solved = self.method.tolerance if derivatives is None else self.method.following
-        source, changed, iterations = [state.unknowns, state.tangents, state.poses], 0.0, 0
+        source, changed, iterations = state.start, 0.0, 0
         for warm in (self._warm[0 if rough else 1], self._warm[0]):
-            warm.inputs[0][:] = p
-            warm.inputs[1][:] = q
-            warm.inputs[2][:], warm.inputs[3][:], warm.inputs[4][:] = source
+            target, start = warm.inputs
+            target[:2], target[2:], start[:] = p, q, source
             warm()
-            residual, at_derivatives, change, conjugate_points, _ = warm.outputs[6].tolist()
+            residual, at_derivatives, change, conjugate_points, drift = warm.outputs[1].tolist()
             changed += change
             iterations += 1 if warm is self._warm[0] else 2
             # Written so that NaN is a failure.
@@ -153,10 +152,10 @@ class RodSolver:
             if residual <= solved and at_derivatives <= (solved if derivatives is None else derivatives):
                 # Into the spare one: the last state stays whole for a caller who goes back to it.
                 assert self._spare is not None
-                self._spare.take(warm.outputs, iterations)
+                self._spare.take(warm.outputs, drift, residual, iterations)
                 self._state, self._spare = self._spare, state
                 return True
-            source = warm.outputs[:3]
+            source = warm.outputs[0][: len(source)]
         return False
 
     def _follow(

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..frozen import read_only
 from .robot import Robot
 
 # How a pose was reached, from cheap to dear; see `RodSolver`.
@@ -40,15 +39,24 @@ class RodState:
 
 
 class RobotState:
-    """All rods as columns, the form in which the graph of a warm step takes and gives them."""
+    """All rods as columns, in the one piece of memory that the graph of a warm step takes and gives (`warm_step`)."""
 
     def __init__(self, robot: Robot, rods: list[RodState]) -> None:
-        self.unknowns = np.stack([rod.unknowns for rod in rods], axis=1)
-        self.tangents = np.concatenate([rod.tangent for rod in rods], axis=1)
-        self.poses = np.stack([rod.pose for rod in rods], axis=1)
-        self.loads = np.stack([rod.loads for rod in rods], axis=1)
-        self.load_tangents = np.concatenate([rod.load_tangent for rod in rods], axis=1)
-        self.scalars = np.stack([rod.scalars for rod in rods], axis=1)
+        n, width = len(rods), len(rods[0].unknowns)
+        shapes = ((width, n), (width, 3 * n), (3, n), (3, n), (3, 3 * n), (5, n))
+        ends = np.cumsum([rows * columns for rows, columns in shapes]).tolist()
+        self._record = np.empty(ends[-1])
+        self.start = self._record[: ends[2]]
+        self.unknowns, self.tangents, self.poses, self.loads, self.load_tangents, self.scalars = (
+            self._record[end - rows * columns : end].reshape(rows, columns, order="F")
+            for end, (rows, columns) in zip(ends, shapes, strict=True)
+        )
+        self.unknowns[:] = np.stack([rod.unknowns for rod in rods], axis=1)
+        self.tangents[:] = np.concatenate([rod.tangent for rod in rods], axis=1)
+        self.poses[:] = np.stack([rod.pose for rod in rods], axis=1)
+        self.loads[:] = np.stack([rod.loads for rod in rods], axis=1)
+        self.load_tangents[:] = np.concatenate([rod.load_tangent for rod in rods], axis=1)
+        self.scalars[:] = np.stack([rod.scalars for rod in rods], axis=1)
         self.residual = math.hypot(*(rod.residual for rod in rods))
         self.iterations = max(rod.iterations for rod in rods)
         self.rung = max((rod.rung for rod in rods), key=RUNGS.index)
@@ -56,16 +64,20 @@ class RobotState:
         self.unstable_rods = tuple(i for i, count in enumerate(self.scalars[3].tolist()) if count)
         units = robot.stiffnesses / robot.lengths**2
         moves = self.load_tangents[:2].reshape(2, -1, 3)
-        self.force = read_only(self.loads[:2] @ units)
-        self.k = read_only(np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths))
-        self.g = read_only(moves[:, :, 2] * units)
+        k = np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths)
+        self._keep(np.concatenate([self.loads[:2] @ units, k.ravel(order="F"), (moves[:, :, 2] * units).ravel("F")]))
 
-    def take(self, outputs: list[np.ndarray], iterations: int) -> None:
+    def _keep(self, result: np.ndarray) -> None:
+        # The views are read-only because what they show is.
+        result.flags.writeable = False
+        self.force = result[:2]
+        self.k, self.g = result[2:6].reshape(2, 2, order="F"), result[6:].reshape(2, -1, order="F")
+
+    def take(self, outputs: list[np.ndarray], drift: float, residual: float, iterations: int) -> None:
         """Copy the results of `warm_step`, which found no conjugate point."""
-        (self.unknowns[:], self.tangents[:], self.poses[:], self.loads[:], self.load_tangents[:],
-         self.scalars[:]) = outputs[:6]  # fmt: skip
-        self.residual, _, _, _, self.drift = outputs[6].tolist()
-        self.force, self.k, self.g = (read_only(output.copy()) for output in outputs[7:])
+        self._record[:] = outputs[0]
+        self._keep(outputs[2].copy())
+        self.residual, self.drift = residual, drift
         self.iterations = iterations
         self.rung = "warm"
         self.unstable_rods = ()

@@ -44,6 +44,7 @@ def summary_table(summary: dict[str, Any]) -> str:
     lines += [times_table(times), ""]
     iterations = summary["qp_iterations"]
     lines += [
+        f"inside the solver {_percent(summary['solver_share'])} of the control steps' time",
         f"QP iterations     p50 {iterations['p50']}, max {iterations['max']}",
         f"peak torque       {summary['peak_torque_Nm']:.3f} N m (limit {summary['torque_limit_Nm']:g}, soft)",
         f"limits active in  {_counts(summary['active_limits'])} of {summary['control_steps']} periods",
@@ -53,6 +54,10 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"failures          {summary['failures']}",
     ]
     return "\n".join(lines)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.0f} %"
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -1,0 +1,141 @@
+"""The solvers of a linear MPC: which of them is asked, with how many iterations, and what the answer cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..errors import InfeasibleError
+from ..linearisation.linear_limits import LinearLimits
+from ..linearisation.linear_model import LinearModel
+from .limited_qp import Limited, LimitedQP, active_kinds
+from .osqp_solver import QPSolver
+from .qp import QuadraticProgram, Rollout, constraint_matrix
+from .tuning import Limits, Tuning
+
+_FEWEST_ITERATIONS = 10  # with which OSQP is tried at all
+
+
+class Workspace:
+    """Solvers for the QPs of one controller: one knows the limits on the rates alone, the others all of them.
+
+    Parameters
+    ----------
+    tuning : Tuning
+    model : LinearModel
+        Of the robot and the period that it is for.
+    """
+
+    def __init__(self, tuning: Tuning, model: LinearModel) -> None:
+        self.n, self.dt = model.B.shape[1], model.dt
+        self._tuning = tuning
+        rates = constraint_matrix(tuning.horizon, self.n)[: 2 * tuning.horizon * self.n].tocsc()
+        self._rates_only = QPSolver(rates, tuning.tolerance, tuning.max_iterations)
+        self._groups = np.repeat(["rate", "rate change"], tuning.horizon * self.n)
+        self._limited: dict[tuple[str, ...], LimitedQP] = {}
+        self._limits_matter = False  # in the last plan, beside those on the rates
+        self._spent, self._inside = 0, 0.0  # iterations and seconds of OSQP in this control step
+        self.rollout = Rollout(tuning.horizon, self.n)
+
+    def limited(self, kinds: tuple[str, ...]) -> LimitedQP:
+        """Solver for limits of these kinds, made once."""
+        if kinds not in self._limited:
+            self._limited[kinds] = LimitedQP(self._tuning, self.n, self.dt, kinds)
+        return self._limited[kinds]
+
+    def reset(self) -> None:
+        """Start afresh."""
+        self._limits_matter = False
+        self._rates_only.reset()
+        for solver in self._limited.values():
+            solver.reset()
+
+    def require(self, models: Sequence[LinearModel]) -> None:
+        """Raise if a model is for another robot or period."""
+        for model in models:
+            if (model.B.shape[1], model.dt) == (self.n, self.dt):
+                continue
+            raise ValueError(
+                f"model has {model.B.shape[1]} motors and dt = {model.dt} s, but this controller was built for "
+                f"{self.n} and {self.dt} s; make a new one"
+            )
+
+    def solve(
+        self,
+        qp: QuadraticProgram,
+        x: np.ndarray,
+        models: Sequence[LinearModel],
+        pose_limits: LinearLimits | None,
+        limits: Limits,
+        warm: np.ndarray | None,
+    ) -> Limited:
+        """Solve with the rates' rows alone; where that breaks another limit, or fails, with all of them.
+
+        An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half;
+        its multipliers are those of the rates' rows, the others being zero. While other limits shape the plans, the
+        whole is solved at once.
+        """
+        self._spent, self._inside = 0, 0.0
+        if not self._limits_matter:
+            n_rates = self._rates_only.m
+            try:
+                self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
+                if warm is not None:
+                    self._rates_only.warm_start(warm)
+                solution = self._rates_only.solve()
+            except InfeasibleError as error:
+                self._count(error)
+            else:
+                states = self.rollout(x, models, solution.x)
+                angles = states[1:, 4:]
+                broken = max(float((limits.angle_lower - angles).max()), float((angles - limits.angle_upper).max()))
+                if pose_limits is not None:
+                    rows = states[1:] @ pose_limits.C.T
+                    broken = max(
+                        broken, float((pose_limits.lower - rows).max()), float((rows - pose_limits.upper).max())
+                    )
+                if broken <= self._tuning.tolerance * self.dt:
+                    return Limited(solution.x, states, {}, active_kinds(solution.y, self._groups), solution)
+                self._spent, self._inside, warm = solution.iterations, solution.run_time, solution.x
+        return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
+
+    def soften(
+        self, qp: QuadraticProgram, x: np.ndarray, models: Sequence[LinearModel], pose_limits: LinearLimits | None
+    ) -> Limited:
+        """Solve with the angle limits softened too, with the iterations that `solve` has left."""
+        return self._solve_whole(qp, x, models, pose_limits, None, soft_angles=True)
+
+    def _solve_whole(
+        self,
+        qp: QuadraticProgram,
+        x: np.ndarray,
+        models: Sequence[LinearModel],
+        pose_limits: LinearLimits | None,
+        warm: np.ndarray | None,
+        soft_angles: bool,
+    ) -> Limited:
+        kinds = () if pose_limits is None else pose_limits.kinds
+        left = self._tuning.max_iterations - self._spent
+        if left < _FEWEST_ITERATIONS:
+            raise InfeasibleError(
+                f"the {self._tuning.max_iterations} iterations allowed are spent", status="maximum iterations reached",
+                iterations=self._spent, limit=None,
+            )  # fmt: skip
+        try:
+            answer = self.limited(kinds).solve(
+                qp, x, models, pose_limits, soft_angles=soft_angles, warm=warm, most=left
+            )
+        except InfeasibleError as error:
+            self._count(error)
+            raise
+        self._spent += answer.solution.iterations
+        self._inside += answer.solution.run_time
+        self._limits_matter = not set(answer.active) <= {"rate", "rate change"}
+        solution = replace(answer.solution, iterations=self._spent, run_time=self._inside)
+        return replace(answer, solution=solution)
+
+    def _count(self, error: InfeasibleError) -> None:
+        self._spent += error.details.get("iterations", 0)
+        self._inside += error.details.get("run_time", 0.0)

@@ -1,0 +1,62 @@
+"""The inertia of the rods in scenes, tunings and the closed loop."""
+
+from dataclasses import replace
+
+import pytest
+
+from pcr_mpc import ModelError, load_scene, load_tuning, make_controller, simulate
+
+from .conftest import CONTROLLERS, MODELS
+
+
+def edited(path, tmp_path, **keys):
+    """The file with ``integrator`` and other keys of its [plant] or [model] table replaced or added."""
+    text = path.read_text().replace("../..", str(MODELS.parent)).replace('"../', f'"{MODELS}/')
+    for key, value in keys.items():
+        table = "[plant]" if "[plant]" in text else "[model]"
+        lines = [line for line in text.splitlines() if line.split("=")[0].strip() != key]
+        at = next(i for i, line in enumerate(lines) if line.startswith(table))
+        text = "\n".join([*lines[: at + 1], f'{key} = "{value}"', *lines[at + 1 :]])
+    (tmp_path / path.name).write_text(text)
+    return tmp_path / path.name
+
+
+def test_scenes_and_tunings_say_which(tmp_path):
+    release = MODELS / "scenes" / "release.toml"
+    assert load_scene(release).make_plant().inertia == "none"
+    for inertia, integrator in (("condensed", "rk4"), ("full", "gauss")):
+        scene = load_scene(edited(release, tmp_path, inertia=inertia, integrator=integrator))
+        plant = scene.make_plant()
+        assert (plant.inertia, plant.integrator) == (inertia, integrator)
+    assert load_tuning(edited(CONTROLLERS / "default.toml", tmp_path, inertia="constant")).model.inertia == "constant"
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ({"inertia": "full", "integrator": "rk4"}, "plant.integrator: is rk4: inertia 'full' needs 'gauss'"),
+        ({"inertia": "none", "integrator": "gauss"}, "plant.integrator: is gauss"),
+        ({"inertia": "constant", "method": "multiple_shooting"}, "plant.inertia: is constant, which needs method"),
+        ({"inertia": "some"}, "plant.inertia"),
+    ],
+)
+def test_what_does_not_go_together_is_named(tmp_path, keys, problem):
+    with pytest.raises(ModelError, match=problem.replace(".", r"\.")):
+        load_scene(edited(MODELS / "scenes" / "release.toml", tmp_path, **keys))
+
+
+def test_the_controller_wants_the_inertia_that_the_robot_has():
+    """On the robot whose rods have mass a model with mass is three times better, on the one of the paper worse."""
+    scene = replace(load_scene(MODELS / "scenes" / "lemniscate.toml"), duration=2.0)
+    errors = {}
+    for of_plant, integrator in (("none", "rk4"), ("condensed", "rk4"), ("full", "gauss")):
+        plant = replace(scene.plant, inertia=of_plant, integrator=integrator, dt=2e-3)
+        for of_model in ("none", "condensed"):
+            tuning = replace(scene.tuning, model=replace(scene.tuning.model, inertia=of_model))
+            case = replace(scene, plant=plant, tuning=tuning)
+            run = simulate(case, case.make_plant(), make_controller(case))
+            errors[of_plant, of_model] = run.summary()["rms_after_1s_mm"]
+    assert errors["condensed", "condensed"] < 0.5 * errors["condensed", "none"]
+    assert errors["none", "none"] < 0.5 * errors["none", "condensed"]
+    for of_model in ("none", "condensed"):
+        assert errors["full", of_model] == pytest.approx(errors["condensed", of_model], rel=0.02)
