@@ -32,6 +32,8 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/basins.py --seeds 3 --out results/basins
 	cp results/basins/*.png docs/
 	$(BIN)/python experiments/linear_validity.py --out docs
+	$(BIN)/python experiments/monte_carlo.py --episodes 500 --out results/monte_carlo/figure
+	cp results/monte_carlo/figure/monte_carlo.png docs/
 	$(BIN)/python experiments/fold_guard.py --out results/fold_guard
 	$(BIN)/python experiments/controllers.py --out results/controllers
 	cp results/fold_guard/*.png results/controllers/*.png docs/

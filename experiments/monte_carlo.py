@@ -163,11 +163,10 @@ def plot(rows: list[Row], title: str, path: Path) -> None:
         among = correlations(mine)
         places = [KINDS.index(name) + 0.27 * (number + 1) for name in among]
         middle.barh(places, list(among.values()), height=0.25, color=colour, label=f"among delay {label}")
-    failures = sum(bool(row["failure"]) for row in rows)
+    label = f"failed: {sum(bool(row['failure']) for row in rows)} of {len(rows)}"
     for axes in (left, right):
-        axes.plot([], [], "x", color=RED, ms=5, label=f"failed: {failures} of {len(rows)}")
-    left.set(xscale="log", xlabel="RMS error of an episode [mm]", ylabel="episodes up to there [%]", title=title)
-    left.set_ylim(0, 118)
+        axes.plot([], [], "x", color=RED, ms=5, label=label)
+    left.set(xscale="log", xlabel="RMS error of an episode [mm]", ylabel="episodes [%]", ylim=(0, 118), title=title)
     left.legend(loc="upper left", fontsize=8)
 
     everything = correlations(rows)
@@ -217,7 +216,7 @@ def replay(scene: Scene, tuning: Tuning, seed: int, folder: Path) -> str:
     try:
         run = simulate_episode(scene, tuning, seed, progress=True)
     except SimulationError as error:
-        print(f"{error}", file=sys.stderr)
+        print(error, file=sys.stderr)
         run = error.run
     run.save(folder)
     plot_run(run, folder / "track.png")

@@ -2,6 +2,8 @@
 
 import json
 import math
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -95,6 +97,39 @@ def test_the_robot_is_another_and_the_controller_does_not_know(scene, monkeypatc
     # The run starts in balance at the reference, which the believed robot would not with these motors.
     assert run.x[0, :2] == pytest.approx([0.0, 0.25], abs=1e-9)
     assert np.abs(run.x[0, 4:] - scene.start().q).max() > 1e-3
+
+
+@pytest.mark.parametrize(("period", "delay"), [(None, 1), (0.005, 2), (0.02, 1)])
+def test_a_shorter_period_does_not_make_the_bus_faster(scene, period, delay):
+    """One period of 10 ms more than told, whatever the tuning's own period is."""
+    seed = next(seed for seed in range(20) if Spread().sample(2, seed).delay == 1)
+    run = simulate_episode(replace(scene, duration=0.04), replace(scene.tuning, period=period), seed)
+    assert run.scene.delay == delay
+    assert run.scene.period == (period or scene.period)
+
+
+def test_only_rk4_is_replaced(scene):
+    """The paper's Euler is there for its own sake, and distributed rods move by an integrator of their own."""
+    for integrator, lighter in (("rk4", "velocity_verlet"), ("semi_implicit_euler",) * 2, ("gauss",) * 2):
+        given = replace(scene, plant=replace(scene.plant, integrator=integrator))
+        assert episodes.lighter(given) == replace(given, plant=replace(given.plant, integrator=lighter))
+
+
+def test_threads_take_turns(scene, monkeypatch):
+    """The rods' graphs of a process share their memory."""
+    inside, most = [], []
+
+    def busy(*_):
+        inside.append(1)
+        most.append(len(inside))
+        time.sleep(0.02)
+        inside.pop()
+        raise ValueError("enough")
+
+    monkeypatch.setattr(episodes, "simulate_episode", busy)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda seed: run_episode(scene, scene.tuning, seed), range(8)))
+    assert most == [1] * 8
 
 
 def test_without_mismatch_it_is_the_scene(scene):

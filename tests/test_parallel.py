@@ -2,9 +2,14 @@
 
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -14,7 +19,7 @@ from pcr_mpc.loop.episodes import EXACT, Spread, run_episode
 from pcr_mpc.loop.parallel import collect, finished, local_workers
 from pcr_mpc.loop.provenance import commit, described, differences, source_digest
 
-from .conftest import MODELS
+from .conftest import MODELS, ROOT
 
 SETTINGS = {"scene": {"mass": 0.25, "rods": [1.0, 2.0]}}
 
@@ -137,6 +142,56 @@ def test_a_worker_that_dies_is_reported_and_the_run_resumes(tmp_path):
     assert [row["seed"] for row in gather(again, range(6), path)] == list(range(6))
     assert set(again.seen) >= {2, 3, 4, 5}
     assert all(json.loads(line).get("threads", "1") == "1" for line in path.read_text().splitlines()[1:])
+
+
+def processes_of(parent):
+    """Its children, by /proc."""
+    found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(parent)], capture_output=True, text=True, check=False)
+    return [int(pid) for pid in found.stdout.split()]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes as Linux lists them")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["interrupted", "killed"])
+def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_workers(how, tmp_path):
+    path = tmp_path / "rows.jsonl"
+    script = f"""
+import pathlib, signal
+from pcr_mpc.loop.parallel import collect, local_workers
+from tests.test_parallel import SETTINGS, slow
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with local_workers(1) as executor:
+        collect(executor, slow, range(100), pathlib.Path({str(path)!r}), SETTINGS, desc="test")
+"""
+    (tmp_path / "study.py").write_text(script)
+    study = subprocess.Popen([sys.executable, str(tmp_path / "study.py")], cwd=ROOT, stderr=subprocess.PIPE, text=True,
+                             env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+    # The rows are there while the study still runs.
+    wait_until(lambda: path.exists() and len(path.read_text().splitlines()) > 2)
+    workers = processes_of(study.pid)
+    assert workers
+    study.send_signal(how)
+    _, errors = study.communicate(timeout=30)
+    if how == signal.SIGINT:
+        assert "interrupted with" in errors
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
+    kept = len(path.read_text().splitlines()) - 1
+    again = Counting()
+    assert len(gather(again, range(100), path)) == 100
+    assert kept - 1 <= 100 - len(again.seen) <= kept < 100
+
+
+def slow(seed):
+    time.sleep(0.05)
+    return {"seed": seed}
+
+
+def wait_until(condition):
+    for _ in range(600):
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail("nothing happened in 30 s")
 
 
 def test_jobs_below_one_are_refused():

@@ -162,7 +162,9 @@ EXACT = Spread(stiffness=0.0, mass=0.0, drag=1.0, base_offset=0.0, delay=0, tip_
 
 
 def lighter(scene: Scene) -> Scene:
-    """Return the scene with velocity Verlet: it costs a third of RK4, and its error is nothing beside the mismatch."""
+    """Return the scene with velocity Verlet for RK4: a third of the cost, and an error that no mismatch notices."""
+    if scene.plant.integrator != "rk4":
+        return scene
     return replace(scene, plant=replace(scene.plant, integrator="velocity_verlet"))
 
 

@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -35,7 +36,7 @@ def local_workers(jobs: int | None = None) -> Iterator[ProcessPoolExecutor]:
     try:
         # Not forked: a fork of a process with threads may hang.
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_leave_interrupts_to_the_parent) as executor:
+        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_follow_the_parent) as executor:
             yield executor
     finally:
         for name, value in before.items():
@@ -50,9 +51,18 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _leave_interrupts_to_the_parent() -> None:
+def _follow_the_parent() -> None:
     # Ctrl-C in a terminal reaches all; a worker brings its task to its end, and the parent begins no other.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A parent that is killed leaves its workers waiting for ever.
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+
+def _end_with_the_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def finished(

@@ -72,6 +72,7 @@ def _toml(tuning: Tuning, comments: Sequence[str]) -> str:
         f"segments = {model.segments}",
         f"steps = {model.steps}",
         f'scheme = "{model.scheme}"',
+        f'inertia = "{model.inertia}"',
         f'linearise = "{model.linearise}"',
         f"predict_delay = {str(model.predict_delay).lower()}",
     ]
