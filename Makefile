@@ -37,7 +37,7 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers,mujoco]"
 	touch $(READY)
 
 clean:
