@@ -127,7 +127,6 @@ class MuJoCoPlant:
             self._data.qfrc_applied[-2:] = f_ext
             self._advance(q, rate)
         except PCRError as error:
-            self._last = None
             error.details["state"] = x.copy()
             raise
         self._last = np.concatenate([self._data.qpos[-2:], self._data.qvel[-2:], q + self.dt * rate])
@@ -142,6 +141,7 @@ class MuJoCoPlant:
     def _advance(self, q: np.ndarray, rate: np.ndarray) -> None:
         model, data, step = self._model, self._data, self._mujoco.mj_step
         h = self.dt / self.substeps
+        before = data.qpos.copy(), data.qvel.copy()
         with self._complaints() as complaints:
             for k in range(self.substeps):
                 start, end = q + k * h * rate, q + (k + 1) * h * rate
@@ -161,11 +161,14 @@ class MuJoCoPlant:
                     data.qpos[:] = 2 * data.qpos - qpos_whole
                     data.qvel[:] = 2 * data.qvel - qvel_whole
         if complaints:
+            last = data.qpos.copy()
+            self._mujoco.mj_resetData(model, data)
+            data.qpos[:], data.qvel[:] = before
             raise ConvergenceError(
                 f"MuJoCo gave up: {complaints[0].strip()} Take shorter steps or fewer links",
                 residual=np.nan,
                 iterations=0,
-                last=data.qpos.copy(),
+                last=last,
             )
 
     @contextmanager
