@@ -27,6 +27,7 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/time_step_limits.py --out docs
 	$(BIN)/python experiments/snap.py --out docs
 	$(BIN)/python experiments/rod_inertia.py --out docs
+	$(BIN)/python -m experiments.mujoco_agreement --out docs
 	$(BIN)/python experiments/workspace.py --out results/workspace
 	cp results/workspace/*.png docs/
 	$(BIN)/python experiments/basins.py --seeds 3 --out results/basins
@@ -42,7 +43,7 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers,cluster,tune]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers,cluster,tune,mujoco]"
 	touch $(READY)
 
 clean:

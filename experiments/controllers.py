@@ -1,9 +1,9 @@
 """How good is the linear MPC? Every controller in every case, error against time per step.
 
-From open loop to nonlinear MPC, and do-mpc where it is installed (extra "peers"), with the same weights (but the
-frozen MPC, which weights its inputs ten times less), horizon, limits and estimates. (do-mpc has no observer here: it is given the true velocity, knows no load and no delay, and
-raises where it fails.) In the cases with something off by 20 % the controllers believe in the nominal robot. Failures
-are rows.
+From open loop to nonlinear MPC, and do-mpc where it is installed (extra "peers"), with the same weights (the frozen
+MPC weights its inputs ten times less), horizon, limits and estimates. (do-mpc has no observer here: it is given the
+true velocity, knows no load and no delay, and raises where it fails.) In the cases with something off by 20 % the
+controllers believe in the nominal robot. Failures are rows.
 
 Writes controllers.csv and controllers.png.
 """

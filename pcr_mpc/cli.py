@@ -16,11 +16,13 @@ from typing import Any
 from .control.tuning import load_tuning
 from .errors import PCRError, SimulationError
 from .loop.episodes import Spread, lighter
+from .loop.model_inertia import by_model_inertia
 from .loop.parallel import local_workers
 from .loop.provenance import commit
 from .loop.run import Run
 from .loop.scene import load_scene
 from .loop.simulate import simulate
+from .loop.simulated_plant import SimulatedPlant
 from .loop.timing import time_scene
 from .loop.tracking import make_controller
 from .loop.tuning_file import default_path, write_tuning
@@ -28,6 +30,8 @@ from .loop.tuning_study import Search, finished_trials, tune
 from .plant.dynamics import Plant
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
+from .plant.mjcf import mjcf
+from .plant.mujoco_plant import MuJoCoPlant
 from .plant.robot import load_robot
 from .plant.stability import all_equilibria, assess_stability
 from .plant.statics import METHODS, solve_statics
@@ -50,9 +54,13 @@ examples:
   pcr-mpc statics models/planar_pair.toml --p 0 0.25 --mode LR     motor angles that hold the tip there
   pcr-mpc statics models/rfrfr.toml --q 120 60 --degrees           where the free tip comes to rest
   pcr-mpc statics models/planar_pair.toml --p 0.18 0.12 --equilibria   what else it could snap to
+  pcr-mpc track models/scenes/lemniscate.toml --plant mujoco       against another engine's robot
+  pcr-mpc export models/planar_pair.toml --p 0 0.25 --mode LR --out pair.xml     that robot as MJCF
   pcr-mpc timing models/scenes/lemniscate.toml           step times against the real-time budgets
   pcr-mpc tune models/scenes/pick_and_place.toml --trials 20 --jobs 2     a better controller for it
 """
+
+_LINKS = 40
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -94,6 +102,8 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("scene", type=Path, help="scene file, such as models/scenes/lemniscate.toml")
     track.add_argument("--controller", type=Path, help="controller tuning instead of the scene's own")
     track.add_argument("--method", choices=METHODS, help="statics of the plant instead of the scene's own")
+    track.add_argument("--plant", choices=("mujoco",), help="simulate the robot with MuJoCo instead (extra 'mujoco')")
+    track.add_argument("--links", type=int, help="of each rod, with --plant mujoco (default 40)")
     track.add_argument("--seed", type=int, default=0, help="of the measurement noise (default 0)")
     track.add_argument("--out", type=Path, help="folder for the results (default results/NAME)")
     track.add_argument("--no-pictures", action="store_true", help="write the record only")
@@ -118,6 +128,13 @@ def _parser() -> argparse.ArgumentParser:
         "with --p of the held tip at the motor angles that balance it",
     )
     statics.add_argument("--picture", type=Path, metavar="FILE", help="draw the pose into FILE")
+
+    export = command("export", _export, "Write a robot in balance as a model file of MuJoCo (MJCF).")
+    export.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
+    export.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), required=True, help="tip position [m]")
+    export.add_argument("--mode", help="working mode, a letter L or R per rod, such as LR")
+    export.add_argument("--links", type=int, default=_LINKS, help=f"of each rod (default {_LINKS})")
+    export.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file, such as planar_pair.xml")
 
     timing = command("timing", _timing, "Time plant steps of every method and the control step against their budgets.")
     timing.add_argument("scene", type=Path, help="scene file")
@@ -147,8 +164,14 @@ def _track(options: argparse.Namespace) -> int:
     tuning = load_tuning(options.controller) if options.controller else None
     if tuning and scene.trajectory is None:
         raise ValueError(f"scene {scene.name} has nothing to track, so --controller has no use")
-    plant = scene.make_plant()
-    if options.method:
+    if options.plant and options.method:
+        raise ValueError("--method has no use with --plant: MuJoCo solves no statics")
+    if options.links is not None and not options.plant:
+        raise ValueError("--links goes with --plant mujoco")
+    plant: SimulatedPlant = scene.make_plant()
+    if options.plant:
+        plant = MuJoCoPlant(scene.robot, links=_LINKS if options.links is None else options.links, dt=scene.plant.dt)
+    elif options.method:
         settings = scene.plant
         plant = Plant(scene.robot, method=options.method, segments=settings.segments, steps=settings.steps,
                       scheme=settings.scheme, integrator=settings.integrator, dt=settings.dt)  # fmt: skip
@@ -161,9 +184,12 @@ def _track(options: argparse.Namespace) -> int:
         failure, run = error, error.run
     files = run.save(folder)
     summary = {**run.summary(), "files": files}
+    used = tuning or scene.tuning
+    if options.plant and used is not None and failure is None:
+        summary["by_model_inertia"] = by_model_inertia(run, used, plant, progress=True)
     if not options.no_pictures:
         files |= _pictures(run, folder)
-        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(json.dumps(summary) if options.json else f"\n{summary_table(summary)}\n\nwritten to {folder}")
     if failure is not None:
         raise failure
@@ -219,6 +245,16 @@ def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_equilibria(found, picture)
     print(f"drawn in {picture}", file=sys.stderr)
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    robot = load_robot(options.robot)
+    eq = inverse_statics(robot, options.p, mode=options.mode)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(mjcf(robot, pose=eq, links=options.links), encoding="utf-8")
+    record = {"file": str(options.out), "links": options.links, "mode": eq.mode, "q": eq.q.tolist()}
+    print(json.dumps(record) if options.json else f"{options.links} links a rod, mode {eq.mode}: {options.out}")
     return 0
 
 

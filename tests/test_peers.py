@@ -21,7 +21,9 @@ from experiments.do_mpc_controller import DoMPC
 @pytest.fixture(scope="module")
 def scene():
     scene = load_scene(MODELS / "scenes" / "limited.toml")
-    return replace(scene, tuning=replace(scene.tuning, horizon=8, observer=None, law="nonlinear_mpc", input_weight=1e-3))
+    return replace(
+        scene, tuning=replace(scene.tuning, horizon=8, observer=None, law="nonlinear_mpc", input_weight=1e-3)
+    )
 
 
 def test_do_mpc_decides_as_the_nonlinear_mpc(scene):

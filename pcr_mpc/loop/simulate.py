@@ -12,15 +12,15 @@ import numpy as np
 from tqdm import tqdm
 
 from ..errors import SimulationError
-from ..plant.dynamics import Plant
 from .controllers import Controller
 from .run import Run
 from .scene import Scene
+from .simulated_plant import SimulatedPlant
 
 
 def simulate(
     scene: Scene,
-    plant: Plant,
+    plant: SimulatedPlant,
     controller: Controller,
     seed: int = 0,
     *,
@@ -32,7 +32,7 @@ def simulate(
     Parameters
     ----------
     scene : Scene
-    plant : Plant
+    plant : SimulatedPlant
         What really moves; its step must divide the scene's control period.
     controller : Controller
         Sees the measured state only, and predicts with a model of its own.

@@ -115,7 +115,6 @@ class Plant:
         self._solver = make_solver(robot, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
         self._at: tuple[float, ...] | None = None
         self._accuracy = 0.0  # of the derivatives there
-        self._lower, self._upper = robot.angle_limits.T.copy()
         n = robot.n_rods
         tip_alone = np.diag([robot.tip_mass] * 2 + [0.0] * n)
         self._mass = read_only(tip_alone), read_only(np.zeros(((2 + n) ** 2, 2 + n)))
@@ -172,12 +171,7 @@ class Plant:
         x = checked_vector("x", x, self.n_states)
         u = checked_vector("u", u, self.robot.n_rods)
         f_ext = checked_vector("f_ext", f_ext, 2)
-        limit = self.robot.rate_limit
-        # A motor that would pass its stop within the step arrives there at the end of it; one that is beyond
-        # its stop comes back no faster than it can.
-        rate = np.minimum(np.maximum(u, -limit), limit)
-        rate = (np.minimum(np.maximum(x[4:] + self.dt * rate, self._lower), self._upper) - x[4:]) / self.dt
-        rate = np.minimum(np.maximum(rate, -limit), limit)
+        rate = self.robot.motor_rates(u, x[4:], self.dt)
         try:
             return np.asarray(self._advance(self, x, rate, f_ext))
         except PCRError as error:

@@ -138,6 +138,15 @@ class Robot:
             raise ValueError(f"{name} is {q} rad, expected at most {_LARGEST_ANGLE:g} rad; take off the whole turns")
         return q
 
+    def motor_rates(self, u: np.ndarray, q: np.ndarray, dt: float) -> np.ndarray:
+        """Rates [rad/s] at which motors at the angles q that are told to turn at u do turn during a step."""
+        limit, lower, upper = self.rate_limit, self.angle_limits[:, 0], self.angle_limits[:, 1]
+        # A motor that would pass its stop within the step arrives there at the end of it; one that is beyond
+        # its stop comes back no faster than it can.
+        rate = np.minimum(np.maximum(u, -limit), limit)
+        rate = (np.minimum(np.maximum(q + dt * rate, lower), upper) - q) / dt
+        return np.asarray(np.minimum(np.maximum(rate, -limit), limit))
+
     def slacks(self, p: np.ndarray) -> list[float]:
         """1 - |p - base| / length of every rod: 0 where it is straight, negative out of reach."""
         x, y = map(float, p)

@@ -33,9 +33,16 @@ def summary_table(summary: dict[str, Any]) -> str:
         ("maximum", "max_mm"),
         ("at the end", "final_error_mm"),
     ]
+    rows: list[tuple[str, ...]]
     if summary["rms_mm"] is not None:
         rows = [(name, "-" if summary[key] is None else f"{summary[key]:.4f}") for name, key in tracking]
         lines += [table(("tracking error", "mm"), rows), ""]
+    if "by_model_inertia" in summary:
+        rows = [
+            (f"  {inertia}", *("-" if figures[key] is None else f"{figures[key]:.4f}" for _, key in tracking[:3]))
+            for inertia, figures in summary["by_model_inertia"].items()
+        ]
+        lines += [table(("rods' inertia in the controller's model", "RMS [mm]", "after 1 s", "maximum"), rows), ""]
     times = [("plant step", summary["plant_step_us"], summary["plant_budget_us"])]
     if summary["control_step_us"]["p50"] is not None:
         times.append(("control step", summary["control_step_us"], summary["control_budget_us"]))
