@@ -104,6 +104,12 @@ class Table:
             raise self.fail(key, f"expected a list of {count}finite numbers, found {value!r}")
         return tuple(float(v) for v in value)
 
+    def profile(self, key: str, default: Any = _REQUIRED) -> Any:
+        """Take a finite number, or a list of them."""
+        if isinstance(self._data.get(key), list):
+            return self.vector(key, None)
+        return self.number(key, default) if key in self._data else self._take(key, default)
+
     def text(self, key: str, default: Any = _REQUIRED, *, choices: tuple[str, ...] = ()) -> Any:
         """Take a string, one of ``choices`` if given."""
         value = self._take(key, default)

@@ -23,7 +23,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     """Linear model of the plant about a state, which need not be in balance.
 
     The rods' force is replaced by F + K dp + G dq with K = dF/dp, G = dF/dq from implicit differentiation
-    of the statics; the resulting affine system m p'' + c p' = -F - K dp - G dq + f_ext, q' = u is
+    of the statics; the resulting affine system m p'' + c p' = -F - K dp - G dq + m g + f_ext, q' = u is
     discretised exactly for inputs held over dt (matrix exponential, not an integrator's step).
 
     Where the plant's rods have inertia, M_pp stands for m, and its change with the pose times the acceleration
@@ -43,7 +43,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     dt : float
         Period of the model [s], usually the control period.
     f_ext : array_like, shape (2,)
-        External force that the model assumes [N].
+        External force besides the tip's weight that the model assumes [N].
 
     Raises
     ------
@@ -69,7 +69,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     function = _discretisation(plant.robot.n_rods, threading.get_ident())
     function.inputs[0][:] = k
     function.inputs[1][:] = g
-    function.inputs[2][:] = force - f_ext
+    function.inputs[2][:] = force - f_ext - plant.tip_weight
     function.inputs[3][:] = x
     function.inputs[4][:] = drag, dt
     function.inputs[5][:], function.inputs[6][:] = inertia, slopes

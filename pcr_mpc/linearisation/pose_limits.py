@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,13 +55,25 @@ class LimitWatch:
     limits : PoseLimits
     plant : Plant
         Follows its branch to the poses; may be the one that is linearised, which then has little left to do. If it is
-        not in closed form, a plant that is takes its place.
+        not in closed form, a plant that is takes its place, unless its rods are not plain.
+
+    Notes
+    -----
+    The margins to folds are known of plain rods only, by the closed form: for others (see `Robot.needs_shooting`)
+    limits on them are not watched, only torque and tip region. Where a plant condenses the rods' weight, torques and
+    margins are those of the weightless rods.
     """
 
     def __init__(self, limits: PoseLimits, plant: Plant) -> None:
         self.limits = limits
         self._robot = robot = plant.robot
-        self._plant = plant if plant.method == "closed_form" else Plant(robot)
+        if plant.method == "closed_form":
+            self._plant, plain = plant, True
+        else:
+            plain = plant.weight != "exact" and robot.weightless().needs_shooting is None
+            self._plant = Plant(robot, weight="none") if plain else plant
+        if not plain:
+            limits = self.limits = replace(limits, rod_margin=None, stiffness=None)
         given = (limits.torque, limits.tip_lower, limits.rod_margin, limits.stiffness)
         self._present = tuple(kind for kind, limit in zip(KINDS, given, strict=True) if limit is not None)
         n = robot.n_rods

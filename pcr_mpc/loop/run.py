@@ -115,7 +115,7 @@ class Run:
 
         The MPC keeps the robot's torque limit where it can; this is what to hold against it.
         """
-        plant = Plant(self.scene.robot, method="closed_form", dt=self.dt)
+        plant = Plant(self.scene.robot, dt=self.dt)
         plant.reset(self.x[0], self.pose)
         states = self.x[:: self.steps_per_period]
         return float(max(np.abs(plant.equilibrium(x).motor_torque).max() for x in states))

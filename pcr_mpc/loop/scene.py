@@ -17,7 +17,8 @@ from ..plant.free_tip import forward_statics, inverse_statics
 from ..plant.inertia import INERTIAS
 from ..plant.robot import Robot, load_robot
 from ..plant.rod import SCHEMES
-from ..plant.statics import METHODS
+from ..plant.statics import METHODS, default_method
+from ..plant.weight import WEIGHTS
 from ..toml_table import Table, read_toml
 from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 
@@ -40,6 +41,7 @@ class PlantSettings:
     dt: float
     on_snap: str
     inertia: str = "none"
+    weight: str | None = None
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,7 @@ class Scene:
             dt=settings.dt,
             on_snap=settings.on_snap,
             inertia=settings.inertia,
+            weight=settings.weight,
         )
 
 
@@ -183,6 +186,8 @@ def load_scene(path: str | Path) -> Scene:
                 torque_limit=limits.number("torque", robot.torque_limit, above=0.0),
             )
             pose_limits = _pose_limits(limits, robot)
+        with file.table("world", {}) as world:
+            robot = replace(robot, gravity=world.vector("gravity", 2, robot.gravity))
         with file.table("start") as start:
             tip = start.vector("tip", 2, None)
             motors = start.vector("motors", robot.n_rods, None)
@@ -192,7 +197,7 @@ def load_scene(path: str | Path) -> Scene:
                 raise start.fail("tip", "give either tip and mode, or motors")
         with file.table("plant") as table:
             plant = PlantSettings(
-                method=table.text("method", "closed_form", choices=METHODS),
+                method=table.text("method", default_method(robot), choices=METHODS),
                 segments=table.integer("segments", 8),
                 steps=table.integer("steps", 1),
                 scheme=table.text("scheme", "rk8", choices=tuple(SCHEMES)),
@@ -200,6 +205,7 @@ def load_scene(path: str | Path) -> Scene:
                 dt=table.number("dt", above=0.0),
                 on_snap=table.text("on_snap", "raise", choices=ON_SNAP),
                 inertia=table.text("inertia", "none", choices=INERTIAS),
+                weight=table.text("weight", None, choices=WEIGHTS),
             )
             if (plant.inertia == "full") != (plant.integrator == "gauss"):
                 raise table.fail("integrator", f"is {plant.integrator}: inertia 'full' needs 'gauss', and only it does")

@@ -17,7 +17,7 @@ _SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors h
 
 
 class MotorTarget:
-    """Shift of the motor angles at which the model's rods carry a given force at a given tip, by Newton's method.
+    """Shift of the motor angles at which the model's rods carry a given force and the tip's weight, by Newton's method.
 
     One iteration a call: the tip and the force change little from one control period to the next, and where they do not
     change it converges. This is what makes the controller free of offset under a constant load.
@@ -49,7 +49,7 @@ class MotorTarget:
         determinant = a * d - b * b
         if determinant < _SINGULAR * a * d:
             return self._shift
-        x, y = (force - found).tolist()
+        x, y = (force + self._plant.tip_weight - found).tolist()
         along, across = (d * x - b * y) / determinant, (a * y - b * x) / determinant
         step = [along * one + across * other for one, other in zip(first, second, strict=True)]
         largest = max(map(abs, step))

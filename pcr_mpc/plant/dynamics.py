@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ from .modal_step import ModalStep
 from .robot import Robot
 from .rod_solver import RodSolver, Snap
 from .rod_state import RobotState
-from .statics import checked_shooting, make_solver
+from .statics import checked_shooting, default_method, make_solver
+from .weight import WEIGHTS, CondensedWeight
 
 ON_SNAP = ("raise", "jump")
 # A simulation uses the derivatives only to predict the next pose.
@@ -30,7 +32,7 @@ _MOST_MODES = 64
 
 
 class Plant:
-    """The robot in motion: m p'' + c p' = -F(p, q) + F_ext, motor angles driven by their rates.
+    """The robot in motion: m p'' + c p' = -F(p, q) + m g + F_ext, motor angles driven by their rates.
 
     The state is x = [p (2), v (2), q (n)] in [m, m/s, rad], the input u = q' (n) in rad/s.
     Rods that have mass add theirs to m, and couple the tip to the motors (see ``inertia``).
@@ -38,8 +40,8 @@ class Plant:
     Parameters
     ----------
     robot : Robot
-    method : {"closed_form", "multiple_shooting", "single_shooting"}
-        Statics of the rods.
+    method : {"closed_form", "multiple_shooting", "single_shooting"}, optional
+        Statics of the rods. None: the closed form where it is exact, else multiple shooting.
     segments, steps, scheme
         Discretisation, see `solve_statics`.
     inertia : {"none", "constant", "condensed", "full"}
@@ -48,6 +50,10 @@ class Plant:
         yardstick (see `strain_modes`). With mass the statics must be the closed form.
     modes : int
         Strain modes per rod, of inertia "full": 12 are within 1e-6 mm of 14 on the default robot.
+    weight : {"none", "condensed", "exact"}, optional
+        Of the rods; the tip's is always there. None; to first order in mu g, by its potential at the weightless shape,
+        which needs the closed form (see `weight`); or distributed along rods that sag, which needs multiple shooting.
+        By default what the method can do: "exact" or "condensed".
     integrator : {"semi_implicit_euler", "velocity_verlet", "rk4", "gauss"}
         The paper's first-order scheme, a second-order one, both with one force evaluation a step, and the
         classical fourth-order one with four; "gauss" belongs to inertia "full" and to nothing else, implicit and of
@@ -79,12 +85,13 @@ class Plant:
         self,
         robot: Robot,
         *,
-        method: str = "closed_form",
+        method: str | None = None,
         segments: int = 8,
         steps: int = 1,
         scheme: str = "rk8",
         inertia: str = "none",
         modes: int = 12,
+        weight: str | None = None,
         integrator: str = "semi_implicit_euler",
         dt: float = 1e-3,
         on_snap: str = "raise",
@@ -97,6 +104,17 @@ class Plant:
             raise ValueError(f"integrator is {integrator!r}, expected one of {', '.join(INTEGRATORS)}, gauss")
         if (inertia == "full") != (integrator == "gauss"):
             raise ValueError(f"inertia={inertia!r} does not go with integrator={integrator!r}: 'full' needs 'gauss'")
+        if weight is not None and weight not in WEIGHTS:
+            raise ValueError(f"weight is {weight!r}, expected one of {', '.join(WEIGHTS)}")
+        if weight is None:
+            heavy = any(robot.gravity) and any(rod.line_density for rod in robot.rods)
+            weight = "none" if not heavy else "condensed" if method == "closed_form" else "exact"
+        rods = robot if weight == "exact" else robot.weightless()
+        method = method or default_method(rods)
+        if weight == "condensed" and method != "closed_form":
+            raise ValueError(f"weight='condensed' needs method='closed_form', not {method!r}; take weight='exact'")
+        if weight != "none" and inertia == "full":
+            raise ValueError(f"inertia='full' has weightless rods, not weight={weight!r}; take weight='none'")
         if not 0.0 < dt < np.inf:
             raise ValueError(f"dt is {dt} s, expected a positive number")
         if inertia != "none" and method != "closed_form":
@@ -106,13 +124,15 @@ class Plant:
         self.robot = robot
         self.method = method
         self.inertia = inertia
+        self.weight = weight
         self.integrator = integrator
         self.dt = dt
         self.n_states = 4 + robot.n_rods
         self._modal = ModalStep(robot, int(modes)) if inertia == "full" else None
         self._advance = self._modal or INTEGRATORS[integrator](robot.n_rods)
         self._mass_moves = inertia in ("condensed", "full")
-        self._solver = make_solver(robot, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
+        self._solver = make_solver(rods, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
+        self._sag = CondensedWeight(robot) if weight == "condensed" else None
         self._at: tuple[float, ...] | None = None
         self._accuracy = 0.0  # of the derivatives there
         n = robot.n_rods
@@ -138,6 +158,11 @@ class Plant:
             self._mass = self._condensed_mass(q)[0], self._mass[1]
 
     @property
+    def tip_weight(self) -> np.ndarray:
+        """m g, shape (2,) [N]."""
+        return self.robot.tip_weight
+
+    @property
     def snaps(self) -> list[Snap]:
         """Snaps since the reset, in order."""
         return self._solver.snaps
@@ -157,7 +182,7 @@ class Plant:
         u : array_like, shape (n,)
             Motor rates [rad/s].
         f_ext : array_like, shape (2,)
-            External force on the tip [N].
+            External force on the tip besides its weight [N].
 
         Returns
         -------
@@ -170,7 +195,7 @@ class Plant:
         """
         x = checked_vector("x", x, self.n_states)
         u = checked_vector("u", u, self.robot.n_rods)
-        f_ext = checked_vector("f_ext", f_ext, 2)
+        f_ext = checked_vector("f_ext", f_ext, 2) + self.tip_weight
         rate = self.robot.motor_rates(u, x[4:], self.dt)
         try:
             return np.asarray(self._advance(self, x, rate, f_ext))
@@ -179,9 +204,12 @@ class Plant:
             raise
 
     def force(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """F at (p, q), following the branch [N]."""
-        self._go(np.asarray(p, dtype=float), np.asarray(q, dtype=float), _PREDICTOR_ACCURACY)
-        return self._solver.force()
+        """F at (p, q), following the branch [N]; the tip is at rest where it is the tip's weight plus F_ext."""
+        q = np.asarray(q, dtype=float)
+        self._go(np.asarray(p, dtype=float), q, _PREDICTOR_ACCURACY)
+        if self._sag is None:
+            return self._solver.force()
+        return read_only(self._solver.force() + self._sag.first(self._unknowns(), q)[1][:2])
 
     def force_and_jacobians(
         self, p: np.ndarray, q: np.ndarray, accuracy: float | None = None
@@ -192,12 +220,15 @@ class Plant:
         """
         self._go(p, q, accuracy)
         k, g = self._solver.jacobians()
-        return self._solver.force(), k, g
+        if self._sag is None:
+            return self._solver.force(), k, g
+        slope, curvature = self._sag.first(self._unknowns(), q)[1], self._sag.second(self._unknowns(), q)
+        return self._solver.force() + slope[:2], k + curvature[:2, :2], g + curvature[:2, 2:]
 
     def rods(self, p: np.ndarray, q: np.ndarray) -> RobotState:
         """Unknowns, loads and derivatives of all rods at (p, q), following the branch; not for single shooting.
 
-        Valid until the plant moves on.
+        A condensed weight, which bends no rod, is no part of them. Valid until the plant moves on.
         """
         if not isinstance(self._solver, RodSolver):
             raise ValueError(f"method {self.method} keeps no unknowns of the rods")
@@ -233,7 +264,24 @@ class Plant:
         """Everything about the rods at state x, following the branch."""
         x = checked_vector("x", x, self.n_states)
         self._go(x[:2], x[4:], None)
-        return self._solver.equilibrium(x[:2], x[4:])
+        eq = self._solver.equilibrium(x[:2], x[4:])
+        if self._sag is None:
+            return eq
+        energy, slope = self._sag.first(self._unknowns(), x[4:])
+        curvature = self._sag.second(self._unknowns(), x[4:])
+        return replace(
+            eq,
+            force=eq.force + slope[:2],
+            dforce_dp=eq.dforce_dp + curvature[:2, :2],
+            dforce_dq=eq.dforce_dq + curvature[:2, 2:],
+            motor_torque=eq.motor_torque + slope[2:],
+            dtorque_dq=eq.dtorque_dq + np.diag(curvature)[2:],
+            energy=eq.energy + energy,
+        )
+
+    def _unknowns(self) -> np.ndarray:
+        assert isinstance(self._solver, RodSolver)
+        return self._solver.state.unknowns
 
     def _go(self, p: np.ndarray, q: np.ndarray, derivatives: float | None) -> None:
         at, accuracy = (*p.tolist(), *q.tolist()), derivatives or 0.0

@@ -9,15 +9,16 @@ import numpy as np
 
 from ..frozen import freeze
 from .robot import Robot
-from .rod import sample_rod
+from .rod import RodPhysics, sample_rod
+from .rod_physics import robot_physics
 
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
     """Static equilibrium of the rods for a held tip: it exists only if the solve converged.
 
-    With U(p, q) the elastic energy, force = dU/dp is what holds the joint and motor_torque = dU/dq is
-    what the motors supply.
+    With U(p, q) the elastic energy and, if the rods have weight, its potential, force = dU/dp is what holds the joint
+    and motor_torque = dU/dq is what the motors supply. The tip's own weight is an external force, and no part of U.
 
     Attributes
     ----------
@@ -39,7 +40,7 @@ class Equilibrium:
     dtorque_dq : ndarray, shape (n,)
         Diagonal of d2U/dq2 [N m/rad]; rods do not couple at a held tip.
     energy : float
-        U [J].
+        U [J]; each rod's weight has its potential zero at its motor.
     rod_forces : ndarray, shape (n, 2)
         n_i, force applied to the tip of each rod [N].
     nodes : ndarray, shape (n, 4, N)
@@ -51,7 +52,7 @@ class Equilibrium:
     rung : str
         Of the solver's ladder: "warm", "newton", "continuation", "snap" or "cold" (see `RodSolver`).
     drift : float
-        Change of the invariant m^2/2 + n . t along the rods, over its size: the discretisation's own error estimate.
+        Change of the `invariant` along the rods, over its size: the discretisation's own error estimate.
     unstable_rods : tuple of int
         Rods with a conjugate point: not stable even with the tip held.
     """
@@ -88,6 +89,11 @@ class Equilibrium:
         """Whether the pose is stable with its motors held: every rod with its tip held, and K > 0."""
         return not self.unstable_rods and bool(self.stiffness_eigenvalues[0] > 0)
 
+    @property
+    def physics(self) -> tuple[RodPhysics | None, ...]:
+        """What each rod has beyond the plain rod, if anything."""
+        return robot_physics(self.robot) or (None,) * self.robot.n_rods
+
     @cached_property
     def mode(self) -> str:
         """Working mode: for each rod the side of its chord, seen from base to tip, to which it bows at its tip.
@@ -95,8 +101,8 @@ class Equilibrium:
         One letter a rod, L(eft) or R(ight): the default robot with its rods bowed outward is "LR".
         """
         letters = []
-        for nodes in self.nodes:
-            _, _, theta, n_x, n_y, _ = sample_rod(nodes, 2)[:, -1]
+        for nodes, physics in zip(self.nodes, self.physics, strict=True):
+            _, _, theta, n_x, n_y, _ = sample_rod(nodes, 2, physics)[:, -1]
             # Near the moment-free tip the rod turns as -m'(L) = n_y cos(theta) - n_x sin(theta); a taut rod has
             # no turn left there, but keeps the sense of its last node.
             turn = (n_y * np.cos(theta) - n_x * np.sin(theta)) / np.hypot(n_x, n_y)
@@ -109,7 +115,7 @@ class Equilibrium:
             raise ValueError(f"n_points is {n_points}, expected at least 2")
         return np.stack(
             [
-                rod.base + rod.length * sample_rod(nodes, n_points)[:2].T
-                for rod, nodes in zip(self.robot.rods, self.nodes, strict=True)
+                rod.base + rod.length * sample_rod(nodes, n_points, physics)[:2].T
+                for rod, nodes, physics in zip(self.robot.rods, self.nodes, self.physics, strict=True)
             ]
         )

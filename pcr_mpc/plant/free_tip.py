@@ -13,7 +13,7 @@ from ..errors import ConvergenceError, PCRError, UnreachableError, UnstableError
 from .chart import held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
-from .rod_method import closed_form_method
+from .rod_method import Shooting, closed_form_method, shooting_method
 from .rod_solver import RodSolver
 
 _MAX_ITERATIONS = 100
@@ -27,6 +27,7 @@ _TIP_STEP = 0.05  # largest tip step of a continuation, in rod lengths
 _OFFSETS = np.linspace(-2.6, 2.6, 40)  # clamp angle minus chord angle, of a cold inverse start [rad]
 _CANDIDATES = 24
 _COMBINATIONS = 100_000
+_SHOOTING = Shooting(steps=2)  # where the closed form does not hold: 1e-8 of F but on taut rods
 _NARROW = 3  # angles between the stops that a cold inverse start needs at least
 
 
@@ -38,7 +39,7 @@ def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equili
     q : array_like, shape (n,)
         Motor angles [rad].
     force : array_like, shape (2,)
-        Wanted F = dU/dp [N], equal to the external force on the tip.
+        External force on the tip besides its own weight m g [N]: wanted is F = dU/dp = force + m g.
     guess : Equilibrium, optional
         Its branch is followed to (q, force) by continuation. None: the stable pose of least potential
         energy among those found by descent from several tip positions.
@@ -46,7 +47,7 @@ def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equili
     Returns
     -------
     Equilibrium
-        Stable, with ``eq.force == force``; ``eq.mode`` says which working mode it is.
+        Stable, with ``eq.force == force + robot.tip_weight``; ``eq.mode`` says which working mode it is.
 
     Raises
     ------
@@ -55,7 +56,7 @@ def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equili
     ConvergenceError
         No stable pose was found.
     """
-    q, force = robot.checked_angles("q", q), checked_vector("force", force, 2)
+    q, force = robot.checked_angles("q", q), checked_vector("force", force, 2) + robot.tip_weight
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
         _require_equilibrium(guess)
@@ -91,7 +92,8 @@ def inverse_statics(
     p : array_like, shape (2,)
         Tip position [m].
     force : array_like, shape (2,)
-        Wanted F = dU/dp [N]: external force minus what the motion needs, f_ext - m a - c v.
+        External force on the tip minus what the motion needs, f_ext - m a - c v [N]; the tip's own weight m g is
+        added to it.
     guess : Equilibrium, optional
         Its branch is followed to (p, force). None: a search within the motors' limits.
     mode : str, optional
@@ -107,7 +109,7 @@ def inverse_statics(
     ConvergenceError
         No stable pose of that mode was found within the motors' limits.
     """
-    p, force = checked_vector("p", p, 2), checked_vector("force", force, 2)
+    p, force = checked_vector("p", p, 2), checked_vector("force", force, 2) + robot.tip_weight
     robot.require_reachable(p)
     solver = _solver(robot, threading.get_ident())
     if guess is not None:
@@ -370,6 +372,13 @@ def _force_scale(robot: Robot) -> float:
     return float((robot.stiffnesses / robot.lengths**2).sum())
 
 
+def free_solver(robot: Robot) -> RodSolver:
+    """Build a solver by the method that is exact for the robot's rods."""
+    if robot.needs_shooting is None:
+        return RodSolver(robot, closed_form_method())
+    return RodSolver(robot, shooting_method(_SHOOTING, robot))
+
+
 @lru_cache(maxsize=32)
 def _solver(robot: Robot, thread: int) -> RodSolver:
-    return RodSolver(robot, closed_form_method())
+    return free_solver(robot)

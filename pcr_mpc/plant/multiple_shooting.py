@@ -44,15 +44,22 @@ import casadi as ca
 import numpy as np
 
 from .robot import Robot
-from .rod import propagation
+from .rod import Layout, interpolated, propagation, unpacked
 
 # A straight tail has determinant 0; with orthonormal rows, less than this is rounding.
 _DETERMINANT_ROUNDING = 1e-12
 
 
 @lru_cache
-def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
+def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = None) -> tuple[Any, Any]:
     """Build the graphs of one rod in normalised units.
+
+    Parameters
+    ----------
+    segments, steps, scheme
+        Discretisation.
+    layout : Layout, optional
+        None: the plain rod. Otherwise both graphs take the rod's numbers (see `RodPhysics`) as a third argument.
 
     Returns
     -------
@@ -60,17 +67,26 @@ def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
         (nodes (4N), pose (3)) -> step (4N), tangent (4N, 3), loads (3), load_tangent (3, 3), scalars (5).
         pose = [d_x, d_y, theta_0] is the tip relative to the base and the clamp angle (which replaces
         nodes[0]); step is the Newton step; tangent and load_tangent are the derivatives of the nodes and of
-        loads = [n_x, n_y, m] at the base with respect to the pose; scalars = [residual norm, length of the
-        step, energy, number of conjugate points, drift of the invariant m^2/2 + n . t], where residual and
-        drift are relative to the size of the load, and the length weighs nodes alike.
+        loads = [n_x, n_y at the tip, m at the base] with respect to the pose; scalars = [residual norm, length of
+        the step, energy, number of conjugate points, drift of the `invariant`], where residual and drift are
+        relative to the size of the load, and the length weighs nodes alike. The energy is U, with the weight's
+        potential counted from the rod's base.
     residual : casadi.Function
         (nodes, pose) -> residual norm, loads.
     """
     n, h = segments, 1.0 / segments
     flat, pose = ca.SX.sym("nodes", 4 * n), ca.SX.sym("pose", 3)
+    arguments = [flat, pose]
     z = [flat[4 * j : 4 * j + 4] for j in range(n)]
     z[0] = ca.vertcat(pose[2], flat[1:4])
-    ends = [propagation(steps, scheme)(node, h) for node in z]
+    if layout is None:
+        weight = ca.SX(2, 1)
+        ends = [propagation(steps, scheme)(node, h) for node in z]
+    else:
+        physics = ca.SX.sym("physics", layout.size)
+        arguments.append(physics)
+        weight = physics[:2]
+        ends = [propagation(steps, scheme, layout)(node, h, j * h, physics) for j, node in enumerate(z)]
     gaps = [ends[j][2:6] - z[j + 1] for j in range(n - 1)]
     position = sum(end[:2] for end in ends) - pose[:2]
     moment = ends[-1][5]
@@ -110,18 +126,35 @@ def rod_newton(segments: int, steps: int, scheme: str) -> tuple[Any, Any]:
     moves = ca.vertcat(*blocks)
 
     energy = sum(end[6] for end in ends)
-    drift = invariant(ends[-1][2:6]) - invariant(z[0])
+    if layout is None:
+        drift = invariant(ends[-1][2:6]) - invariant(z[0])
+    else:
+        # Each piece counts the energy of its weight from where it begins.
+        energy -= h * sum(ca.dot(weight, end[:2]) * (n - 1 - j) for j, end in enumerate(ends))
+        drift = invariant(ends[-1][2:6], layout, physics, 1.0) - invariant(z[0], layout, physics, 0.0)
+        drift += sum(ca.dot(weight, end[:2]) - end[7] for end in ends)
     length = ca.norm_2(ca.repmat(weights, n, 1) * moves[:, 0])
     scalars = ca.vertcat(norm, length, energy, conjugate_points, drift / (load + z[0][3] ** 2 / 2))
-    results = [moves[:, 0], moves[:, 1:], z[0][1:], base_loads[:, 1:], scalars]
+    # The force at the tip is that at the base less the weight in between, which no change of the pose changes.
+    loads = ca.vertcat(z[0][1:3] - weight, z[0][3])
+    results = [moves[:, 0], moves[:, 1:], loads, base_loads[:, 1:], scalars]
     options = {"cse": True}
-    newton = ca.Function("rod_newton", [flat, pose], [ca.densify(r) for r in results], options)
-    return newton, ca.Function("rod_residual", [flat, pose], [norm, z[0][1:]], options)
+    newton = ca.Function("rod_newton", arguments, [ca.densify(r) for r in results], options)
+    return newton, ca.Function("rod_residual", arguments, [norm, loads], options)
 
 
-def invariant(z: Any) -> Any:
-    """m^2/2 + n . t, constant along an exact rod; its drift measures the discretisation."""
-    return z[3] ** 2 / 2 + z[1] * ca.cos(z[0]) + z[2] * ca.sin(z[0])
+def invariant(z: Any, layout: Layout | None = None, physics: Any = None, s: float = 0.0) -> Any:
+    """m^2/2 + n . t, constant along an exact plain rod; its drift measures the discretisation.
+
+    In general H = m^2/(2 f) + kappa0 m + n.t + c (n.t)^2/2 + w.r, the Hamiltonian of the rod equations with momenta n
+    and m, changes only by what f and kappa0 do along the rod. Here without w.r.
+    """
+    pull = z[1] * ca.cos(z[0]) + z[2] * ca.sin(z[0])
+    if layout is None:
+        return z[3] ** 2 / 2 + pull
+    _, compliance, curvature, stiffness = unpacked(layout, physics)
+    f = 1 if stiffness is None else interpolated(stiffness, s)
+    return z[3] ** 2 / (2 * f) + interpolated(curvature, s) * z[3] + pull + compliance * pull**2 / 2
 
 
 def _orthonormal_rows(t: Any, r: Any) -> tuple[Any, Any]:

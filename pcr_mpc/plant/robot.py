@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,11 @@ from ..toml_table import read_toml
 _POSITIVE = {"minimum": 1e-30, "maximum": 1e30}
 _NOT_NEGATIVE = {"minimum": 0.0, "maximum": 1e30}
 _ROD_NUMBERS = {"length": _POSITIVE, "bending_stiffness": _POSITIVE, "line_density": _NOT_NEGATIVE}
+# Of EI along a rod, relative to EI.
+_STIFFNESS_RANGE = (1e-3, 1e3)
+# Strain of a rod that can stretch beyond which no rod is elastic.
+_LARGEST_STRAIN = 0.01
+_MOST_KNOTS = 65  # of a property along a rod
 _ROBOT_NUMBERS = {
     "tip_mass": _POSITIVE,
     "drag": _NOT_NEGATIVE,
@@ -34,7 +39,7 @@ _LARGEST_ANGLE = 1e6
 
 @dataclass(frozen=True)
 class Rod:
-    """A uniform, inextensible, naturally straight elastic rod clamped to its motor.
+    """An elastic rod clamped to its motor; uniform, inextensible and straight at rest unless it says otherwise.
 
     Attributes
     ----------
@@ -48,6 +53,13 @@ class Rod:
         Mass per length [kg/m]; the massless model of the paper does not use it.
     angle_limits : (float, float)
         Least and greatest motor angle [rad].
+    curvature : float or tuple of float
+        kappa0 at rest [1/m], positive to the left: one number, or values at equally spaced s from base to tip, linear
+        in between.
+    stiffness_factors : tuple of float
+        EI(s)/EI, likewise.
+    axial_stiffness : float
+        EA [N]; infinite for a rod that does not stretch.
     """
 
     base: tuple[float, float]
@@ -55,15 +67,33 @@ class Rod:
     bending_stiffness: float
     line_density: float
     angle_limits: tuple[float, float]
+    curvature: float | tuple[float, ...] = 0.0
+    stiffness_factors: tuple[float, ...] = (1.0,)
+    axial_stiffness: float = math.inf
 
     def __post_init__(self) -> None:
         _check_numbers(self, _ROD_NUMBERS)
+        lowest, highest = _STIFFNESS_RANGE
+        _check_profile(self, "curvature", minimum=-1e30, maximum=1e30)
+        _check_profile(self, "stiffness_factors", minimum=lowest, maximum=highest)
+        if self.axial_stiffness != math.inf:
+            _check_numbers(self, {"axial_stiffness": _POSITIVE})
         for name in ("base", "angle_limits"):
             pair = checked_vector(name, getattr(self, name), 2)
             object.__setattr__(self, name, tuple(pair.tolist()))
         lower, upper = self.angle_limits
         if lower >= upper:
             raise ModelError(f"angle_limits: lower {lower} is not below upper {upper}", key="angle_limits")
+
+    @property
+    def curvatures(self) -> tuple[float, ...]:
+        """kappa0 at its knots [1/m]."""
+        return self.curvature if isinstance(self.curvature, tuple) else (self.curvature,)
+
+    @property
+    def stretches(self) -> bool:
+        """Whether EA is finite."""
+        return self.axial_stiffness != math.inf
 
 
 @dataclass(frozen=True)
@@ -86,6 +116,8 @@ class Robot:
         Greatest change of the motor rate [rad/s^2].
     torque_limit : float
         Greatest motor torque [N m].
+    gravity : (float, float)
+        In the plane of the robot [m/s^2]; zero for a robot that lies flat.
     """
 
     name: str
@@ -95,9 +127,11 @@ class Robot:
     rate_limit: float
     acceleration_limit: float
     torque_limit: float
+    gravity: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         _check_numbers(self, _ROBOT_NUMBERS)
+        object.__setattr__(self, "gravity", tuple(checked_vector("gravity", self.gravity, 2).tolist()))
         object.__setattr__(self, "rods", tuple(self.rods))
         for rod in self.rods:
             if not isinstance(rod, Rod):
@@ -110,6 +144,26 @@ class Robot:
     def n_rods(self) -> int:
         """Number of rods, equal to the number of motors."""
         return len(self.rods)
+
+    @property
+    def needs_shooting(self) -> str | None:
+        """Why the closed form does not hold for these rods, or None where it does: then it is exact."""
+        reasons = {
+            "is curved at rest": any(any(rod.curvatures) for rod in self.rods),
+            "changes its stiffness along its length": any(set(rod.stiffness_factors) != {1.0} for rod in self.rods),
+            "stretches": any(rod.stretches for rod in self.rods),
+            "has weight": any(self.gravity) and any(rod.line_density for rod in self.rods),
+        }
+        return next((f"a rod of {self.name} {reason}" for reason, holds in reasons.items() if holds), None)
+
+    @cached_property
+    def tip_weight(self) -> np.ndarray:
+        """m g, shape (2,) [N]."""
+        return read_only(self.tip_mass * np.array(self.gravity))
+
+    def weightless(self) -> Robot:
+        """Return the same robot without gravity."""
+        return replace(self, gravity=(0.0, 0.0))
 
     @cached_property
     def bases(self) -> np.ndarray:
@@ -155,8 +209,9 @@ class Robot:
     def require_reachable(self, p: np.ndarray) -> None:
         """Raise `UnreachableError` if some rod cannot reach ``p``, shape (2,) [m], or is straight there."""
         for i, slack in enumerate(self.slacks(p)):
+            least = -_LARGEST_STRAIN if self.rods[i].stretches else _LEAST_SLACK
             # Written so that NaN is out of reach.
-            if not slack >= _LEAST_SLACK:
+            if not slack >= least:
                 length = self.rods[i].length
                 distance = length * (1.0 - slack)
                 advice = (
@@ -171,6 +226,22 @@ class Robot:
                     distance=distance,
                     length=length,
                 )
+
+
+def _check_profile(rod: Rod, key: str, *, minimum: float, maximum: float) -> None:
+    """Replace a property along the rod by a tuple of floats, or by a float if it is one number."""
+    value = getattr(rod, key)
+    try:
+        if isinstance(value, tuple | list | np.ndarray):
+            values = tuple(checked_number(key, v, minimum=minimum, maximum=maximum) for v in value)
+            if not values or len(values) > _MOST_KNOTS:
+                raise ValueError(f"{key}: expected 1 to {_MOST_KNOTS} numbers, found {len(values)}")
+            object.__setattr__(rod, key, values)
+        else:
+            number = checked_number(key, value, minimum=minimum, maximum=maximum)
+            object.__setattr__(rod, key, number if key == "curvature" else (number,))
+    except ValueError as error:
+        raise ModelError(str(error), key=key) from None
 
 
 def _check_numbers(instance: Any, bounds: dict[str, dict[str, float]]) -> None:
@@ -201,8 +272,13 @@ def load_robot(path: str | Path) -> Robot:
                         bending_stiffness=table.number("bending_stiffness"),
                         line_density=table.number("line_density"),
                         angle_limits=table.vector("angle_limits", 2),
+                        curvature=table.profile("curvature", 0.0),
+                        stiffness_factors=table.profile("stiffness_factors", (1.0,)),
+                        axial_stiffness=table.number("axial_stiffness", math.inf),
                     )
                 )
+        with file.table("world", {}) as world:
+            gravity = world.vector("gravity", 2, (0.0, 0.0))
         with file.table("tip") as tip, file.table("motors") as motors:
             numbers = {
                 "tip_mass": tip.number("mass", **_ROBOT_NUMBERS["tip_mass"]),
@@ -210,4 +286,4 @@ def load_robot(path: str | Path) -> Robot:
                 **{key: motors.number(key, **_ROBOT_NUMBERS[key])
                    for key in ("rate_limit", "acceleration_limit", "torque_limit")},
             }  # fmt: skip
-        return Robot(name=name, rods=tuple(rods), **numbers)
+        return Robot(name=name, rods=tuple(rods), gravity=gravity, **numbers)

@@ -11,7 +11,9 @@ from ..buffered import BufferedFunction
 from ..errors import ConvergenceError
 from . import elastica
 from .chart import critical_load, held_shapes
+from .rod import RodPhysics
 from .rod_method import RodMethod
+from .rod_physics import plain_physics
 from .rod_state import RodState
 from .snap import landing
 
@@ -24,6 +26,9 @@ BRANCH_CHANGE = 0.3
 _FOLD_MARGIN = 0.15
 _SMALLEST_SUBSTEP = 1.0 / 1024.0
 _SNAP_NODES = 64
+# A cold start of a rod that is not plain begins at a tip no further from its base than this, in units of L.
+_WELL_BENT = 0.9
+_SMALLEST_GROWTH = 1.0 / 256.0
 _FURTHEST = 0.1  # from a fold, in units of L and rad, at which its shape is sought to be gone
 
 
@@ -35,8 +40,15 @@ class NotConverged(Exception):
         self.residual, self.iterations, self.unknowns = residual, iterations, unknowns
 
 
+class _Crossed(NotConverged):
+    """It landed on the other side of a fold."""
+
+
 class BranchEnds(NotConverged):
-    """It failed because the rod has come to a fold: how far it came, how short of the limit, and the next step."""
+    """It failed because the rod has come to a fold: how far it came, how short of the limit, and the next step.
+
+    The margin is NaN for rods that are not plain, whose limit has no table.
+    """
 
     def __init__(self, failure: NotConverged, last: RodState, margin: float, step: np.ndarray) -> None:
         super().__init__(failure.residual, failure.iterations, failure.unknowns, str(failure))
@@ -49,16 +61,61 @@ class RodFollower:
     Parameters
     ----------
     method : RodMethod
+    physics : RodPhysics or None
+        Of the rod, if it is not plain.
     """
 
-    def __init__(self, method: RodMethod) -> None:
+    def __init__(self, method: RodMethod, physics: RodPhysics | None = None) -> None:
         self.method = method
+        self._physics = physics
         self._newton = BufferedFunction(method.newton)
         self._check = BufferedFunction(method.residual)
         self._retract = BufferedFunction(method.retract)
+        if physics is not None:
+            self._become(physics.values)
 
     def cold(self, pose: np.ndarray) -> RodState:
-        """Stable shape of least energy."""
+        """Stable shape of least energy; of a rod that is not plain, the one into which that of a plain rod grows."""
+        if self._physics is None:
+            return self._from_chart(pose)
+        # The chart is of plain rods, and shooting resolves no taut ones from scratch.
+        near = pose.copy()
+        near[:2] *= min(1.0, _WELL_BENT / max(math.hypot(*pose[:2]), _WELL_BENT))
+        return replace(self.follow(self._grown(near, self._physics), pose), rung="cold")
+
+    def _become(self, values: np.ndarray) -> None:
+        self._newton.inputs[2][:] = self._check.inputs[2][:] = values
+
+    def _grown(self, pose: np.ndarray, physics: RodPhysics) -> RodState:
+        """Follow the stable shape from a plain rod to this one at a held pose, by growing what makes the difference."""
+        plain = plain_physics(physics.layout)
+        try:
+            self._become(plain)
+            state = last = self._from_chart(pose)
+            done, before, step = 0.0, 0.0, 0.5
+            while done < 1.0:
+                target = min(1.0, done + step)
+                # The shape goes on as it went since the last but one.
+                ahead = (target - done) / (done - before) if done > before else 0.0
+                predicted = state.unknowns + ahead * (state.unknowns - last.unknowns)
+                self._become(plain + target * (physics.values - plain))
+                try:
+                    grown = self.solve(pose, predicted, most=_WARM_ITERATIONS)
+                    moved = np.abs((grown.unknowns - predicted)[self.method.branch]).max()
+                    if moved > BRANCH_CHANGE or not grown.stable:
+                        raise NotConverged(grown.residual, grown.iterations, grown.unknowns, "left its branch")
+                except NotConverged as failure:
+                    step /= 2
+                    if step < _SMALLEST_GROWTH:
+                        reason = f"the shape of the plain rod is lost {100 * done:.0f} % of the way to this rod"
+                        raise NotConverged(failure.residual, failure.iterations, failure.unknowns, reason) from None
+                else:
+                    last, state, before, done, step = state, grown, done, target, 2 * step
+            return state
+        finally:
+            self._become(physics.values)
+
+    def _from_chart(self, pose: np.ndarray) -> RodState:
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         xi, eta = cos * pose[0] + sin * pose[1], cos * pose[1] - sin * pose[0]
         last = NotConverged(math.nan, 0, pose, "no stable shape found")
@@ -76,7 +133,7 @@ class RodFollower:
 
     def from_nodes(self, pose: np.ndarray, nodes: np.ndarray) -> RodState:
         """Shape near given nodes, shape (4, N)."""
-        starts = self.method.from_nodes(nodes)
+        starts = self.method.from_nodes(nodes, self._physics)
         for unknowns in starts[:-1]:
             try:
                 return self.solve(pose, unknowns)
@@ -95,20 +152,21 @@ class RodFollower:
                 raise
             first = failure
         # Continuation along the straight line from the last pose, sub-steps halved and doubled as they go.
-        state, done, substep = start, 0.0, 0.5
+        state, done, substep, crossed = start, 0.0, 0.5, False
         while done < 1.0:
             target = 1.0 if done + substep >= 1.0 else done + substep
             try:
                 state = self._predict(state, start.pose + target * (pose - start.pose), None)
-            except NotConverged:
+            except NotConverged as failure:
                 substep /= 2
+                crossed = crossed or isinstance(failure, _Crossed)
                 if substep < _SMALLEST_SUBSTEP:
                     margin = self._margin(state)
-                    if margin > _FOLD_MARGIN:
+                    if margin > _FOLD_MARGIN or (math.isnan(margin) and not crossed):
                         raise first from None
                     raise BranchEnds(first, state, margin, 2 * substep * (pose - start.pose)) from None
             else:
-                done, substep = target, 2 * substep
+                done, substep, crossed = target, 2 * substep, False
         return replace(state, rung="continuation")
 
     def snap(self, fold: BranchEnds) -> RodState:
@@ -193,7 +251,9 @@ class RodFollower:
         return self._retract.outputs[0].copy()
 
     def _margin(self, state: RodState) -> float:
-        """1 - lambda / lambda_c."""
+        """1 - lambda / lambda_c, known of plain rods only."""
+        if self._physics is not None:
+            return math.nan
         nodes = self.method.to_nodes(state.unknowns, state.pose[2], _SNAP_NODES)
         log_tip_angle, load, _ = elastica.from_nodes(nodes)
         return 1.0 - float(load) / critical_load(float(log_tip_angle))
@@ -206,7 +266,7 @@ class RodFollower:
             raise NotConverged(state.residual, state.iterations, state.unknowns, "left its branch")
         # A stable branch does not turn unstable: it ends, and Newton's method landed on its other side.
         if start.stable and not state.stable:
-            raise NotConverged(state.residual, state.iterations, state.unknowns, "walked through a fold")
+            raise _Crossed(state.residual, state.iterations, state.unknowns, "walked through a fold")
         return state
 
     def _state(

@@ -13,7 +13,8 @@ import numpy as np
 from . import elastica, multiple_shooting
 from .chart import HeldShape
 from .robot import Robot
-from .rod import sample_rod
+from .rod import RodPhysics, aligned_steps, sample_rod
+from .rod_physics import robot_physics
 
 # Graphs up to this size are inlined into the graph of the whole robot; larger ones are called by it.
 _INLINED_INSTRUCTIONS = 4000
@@ -58,9 +59,11 @@ class RodMethod:
     from_shape : callable
         (shape, clamp angle) -> unknowns: a cold start.
     from_nodes : callable
-        nodes (4, N) -> list of unknowns: starts from an equilibrium or a guess, to be tried in this order.
+        (nodes (4, N), physics) -> list of unknowns: starts from an equilibrium or a guess, to be tried in this order.
     to_nodes : callable
         (unknowns, clamp angle, wanted number N) -> nodes (4, N); the shooting methods keep their own number.
+    physics : tuple of RodPhysics or None
+        Of each rod: the third argument of its graphs. None: plain rods, whose graphs have none.
     """
 
     name: str
@@ -71,20 +74,27 @@ class RodMethod:
     following: float
     branch: slice
     from_shape: Callable[[HeldShape, float], np.ndarray]
-    from_nodes: Callable[[np.ndarray], list[np.ndarray]]
+    from_nodes: Callable[[np.ndarray, RodPhysics | None], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
+    physics: tuple[RodPhysics, ...] | None = None
+
+    def physics_of(self, rod: int) -> RodPhysics | None:
+        """Physics of one rod."""
+        return None if self.physics is None else self.physics[rod]
 
 
 @lru_cache
-def shooting_method(shooting: Shooting) -> RodMethod:
-    """Multiple shooting, paper sec. 4; the unknowns are the nodes."""
-    n = shooting.segments
-    newton, residual = multiple_shooting.rod_newton(n, shooting.steps, shooting.scheme)
+def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
+    """Multiple shooting, paper sec. 4, for any rods; the unknowns are the nodes."""
+    n, physics = shooting.segments, robot_physics(robot)
+    layout = None if physics is None else physics[0].layout
+    steps = aligned_steps(layout, n, shooting.steps)
+    newton, residual = multiple_shooting.rod_newton(n, steps, shooting.scheme, layout)
     start, change = ca.SX.sym("start", 4 * n), ca.SX.sym("change", 4 * n)
 
-    def from_nodes(nodes: np.ndarray) -> list[np.ndarray]:
+    def from_nodes(nodes: np.ndarray, of_rod: RodPhysics | None) -> list[np.ndarray]:
         same = nodes.shape[1] == n
-        return [(nodes if same else sample_rod(nodes, n + 1)[2:, :n]).ravel(order="F")]
+        return [(nodes if same else sample_rod(nodes, n + 1, of_rod)[2:, :n]).ravel(order="F")]
 
     return RodMethod(
         name="multiple_shooting",
@@ -98,6 +108,7 @@ def shooting_method(shooting: Shooting) -> RodMethod:
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
         to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
+        physics=physics,
     )
 
 
@@ -114,7 +125,7 @@ def closed_form_method() -> RodMethod:
         following=1e-11,
         branch=slice(0, 3),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
-        from_nodes=lambda nodes: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
+        from_nodes=lambda nodes, _: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
         to_nodes=elastica.nodes,
     )
 
@@ -147,13 +158,15 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     residuals, roughest, changes = [], [], []
     force, k, g = ca.MX(2, 1), ca.MX(2, 2), []
     for i, rod in enumerate(robot.rods):
+        of_rod = method.physics_of(i)
+        known = [] if of_rod is None else [ca.DM(of_rod.values)]
         pose = ca.vertcat((p - ca.DM(rod.base)) / rod.length, q[i])
         start = tangents[:, 3 * i : 3 * i + 3]
         u = predicted = method.retract(unknowns[:, i], start @ (pose - poses[:, i]))
         for _ in range(iterations):
-            step, tangent, _, load_tangent, scalars = method.newton(u, pose)
+            step, tangent, _, load_tangent, scalars = method.newton(u, pose, *known)
             u = method.retract(u, step)
-        residual, loads = method.residual(u, pose)
+        residual, loads = method.residual(u, pose, *known)
         for name, value in zip(columns, (u, tangent, pose, loads, load_tangent, scalars), strict=True):
             columns[name].append(value)
         residuals.append(residual)

@@ -14,6 +14,7 @@ from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod_follower import BRANCH_CHANGE, BranchEnds, NotConverged, RodFollower
 from .rod_method import RodMethod, warm_step
+from .rod_physics import require_plain
 from .rod_state import RobotState, RodState
 
 _ROUGH = 1e-4
@@ -48,6 +49,7 @@ class RodSolver:
     ----------
     robot : Robot
     method : RodMethod
+        Of this robot.
     snapping : bool
         What `move` does where a rod's branch ends: raise, or let the rod fall to the stable shape that the
         descent of its energy reaches, recorded in ``snaps``.
@@ -68,12 +70,18 @@ class RodSolver:
     """
 
     def __init__(self, robot: Robot, method: RodMethod, *, snapping: bool = False) -> None:
+        if method.physics is None:
+            require_plain(robot, f"method {method.name!r}")
+        elif snapping:
+            require_plain(robot, "on_snap='jump'")
         self.robot = robot
         self.method = method
         self.snapping = snapping
         self.rungs: Counter[str] = Counter()
         self.snaps: list[Snap] = []
-        self._rod = RodFollower(method)
+        # Plain rods share one follower.
+        count = 1 if method.physics is None else robot.n_rods
+        self._followers = [RodFollower(method, method.physics_of(i)) for i in range(count)] * (robot.n_rods // count)
         self._warm = [BufferedFunction(warm_step(robot, method, iterations)) for iterations in (1, 2)]
         self._state: RobotState | None = None
         self._spare: RobotState | None = None
@@ -90,7 +98,8 @@ class RodSolver:
         rods = []
         for i, pose in enumerate(self._poses(p, q)):
             try:
-                rods.append(self._rod.cold(pose) if nodes is None else self._rod.from_nodes(pose, nodes[i]))
+                rod = self._followers[i]
+                rods.append(rod.cold(pose) if nodes is None else rod.from_nodes(pose, nodes[i]))
             except NotConverged as failure:
                 raise self._error(i, failure, p, q) from None
         self._state, self._spare = RobotState(self.robot, rods), RobotState(self.robot, rods)
@@ -169,12 +178,12 @@ class RodSolver:
     ) -> RodState:
         for count in range(_MOST_SNAPS):
             try:
-                state = self._rod.follow(start, pose, derivatives, continuation=continuation)
+                state = self._followers[i].follow(start, pose, derivatives, continuation=continuation)
                 return replace(state, rung="snap") if count else state
             except BranchEnds as fold:
                 if not self.snapping:
                     raise
-                fallen = self._rod.snap(fold)
+                fallen = self._followers[i].snap(fold)
                 rod = self.robot.rods[i]
                 x, y = (np.array(rod.base) + rod.length * fallen.pose[:2]).tolist()
                 lost = (fold.last.energy - fallen.energy) * float(self._moment_units[i])
@@ -254,9 +263,10 @@ class RodSolver:
 
     def _error(self, rod: int, failure: NotConverged, p: np.ndarray, q: np.ndarray) -> PCRError:
         if isinstance(failure, BranchEnds):
+            left = "" if math.isnan(failure.margin) else f", with {100 * failure.margin:.1f} % left to its limit"
             return UnstableError(
                 f"rod {rod} cannot follow to p = {np.array(p)} m, q = {np.array(q)} rad: its branch ends "
-                f"on the way, with {100 * failure.margin:.1f} % left to its limit of stability; it would snap to "
+                f"on the way{left}{' of stability' if left else ''}; it would snap to "
                 "another shape; keep away from this pose, or let the plant snap",
                 rod=rod,
                 margin=failure.margin,

@@ -20,7 +20,7 @@ class RodState:
     pose: np.ndarray  # (3,) tip relative to base / L, clamp angle
     unknowns: np.ndarray
     tangent: np.ndarray  # d unknowns / d pose
-    loads: np.ndarray  # (3,) n_x, n_y, m at the base
+    loads: np.ndarray  # (3,) n_x, n_y at the tip, m at the base
     load_tangent: np.ndarray  # (3, 3) d loads / d pose
     scalars: np.ndarray  # (5,) residual, step length, energy, conjugate points, drift
     residual: float

@@ -12,11 +12,12 @@ from ..errors import ConvergenceError, PCRError, checked_vector
 from . import elastica
 from .chart import HeldShape, critical_load, stable_shapes
 from .equilibrium import Equilibrium
-from .free_tip import settle
+from .free_tip import free_solver, settle
 from .multiple_shooting import rod_newton
 from .robot import Robot
-from .rod import sample_rod
+from .rod import aligned_steps, sample_rod
 from .rod_method import closed_form_method
+from .rod_physics import require_plain
 from .rod_solver import RodSolver
 
 _MAX_ITERATIONS = 40
@@ -33,7 +34,8 @@ class Stability:
         Of the robot with its motors held: those of its rods with the tip held, and the negative eigenvalues of
         K. Zero if and only if the pose is stable.
     rod_margins : ndarray, shape (n,)
-        1 - lambda / lambda_c of each rod: 1 unloaded, 0 at the limit, negative beyond.
+        1 - lambda / lambda_c of each rod: 1 unloaded, 0 at the limit, negative beyond. NaN where the rods are not
+        plain (see `Robot.needs_shooting`): their limit is not a matter of one load.
     stiffness_eigenvalues : ndarray, shape (2,)
         Of K, ascending [N/m]. Where one passes zero the free tip snaps ("type 2" singularity).
     motor_authority : float
@@ -52,12 +54,19 @@ class Stability:
 
 
 def assess_stability(eq: Equilibrium) -> Stability:
-    """Stability by the closed form: lambda against lambda_c(k) of each rod, and the eigenvalues of K."""
-    margins, count = np.empty(eq.robot.n_rods), 0
-    for i, nodes in enumerate(eq.nodes):
-        log_tip_angle, load, _ = elastica.from_nodes(nodes)
-        margins[i] = 1.0 - load / critical_load(log_tip_angle)
-        count += elastica.conjugate_points(np.array([log_tip_angle, load, 1.0]))
+    """Stability of the rods with the tip held, and the eigenvalues of K.
+
+    Plain rods are judged by the closed form, lambda against lambda_c(k); others by `count_conjugate_points`, which
+    gives no margin.
+    """
+    margins, count = np.full(eq.robot.n_rods, np.nan), 0
+    if eq.robot.needs_shooting is not None:
+        count = count_conjugate_points(eq)
+    else:
+        for i, nodes in enumerate(eq.nodes):
+            log_tip_angle, load, _ = elastica.from_nodes(nodes)
+            margins[i] = 1.0 - load / critical_load(log_tip_angle)
+            count += elastica.conjugate_points(np.array([log_tip_angle, load, 1.0]))
     return Stability(
         unstable_directions=count + int((eq.stiffness_eigenvalues < 0).sum()),
         rod_margins=margins,
@@ -77,12 +86,14 @@ def count_conjugate_points(eq: Equilibrium, segments: int = 16) -> int:
     ConvergenceError
         The segments do not resolve a taut rod.
     """
-    newton, _ = rod_newton(segments, 2, "rk8")
+    layout = None if eq.physics[0] is None else eq.physics[0].layout
+    newton, _ = rod_newton(segments, aligned_steps(layout, segments, 2), "rk8", layout)
     count = 0.0
-    for rod, nodes, angle in zip(eq.robot.rods, eq.nodes, eq.q, strict=True):
-        sampled = sample_rod(nodes, segments + 1)[2:, :segments]
+    for rod, nodes, angle, physics in zip(eq.robot.rods, eq.nodes, eq.q, eq.physics, strict=True):
+        sampled = sample_rod(nodes, segments + 1, physics)[2:, :segments]
+        known = () if physics is None else (physics.values,)
         pose = np.append((eq.p - rod.base) / rod.length, angle)
-        residual, _, _, conjugate_points, drift = newton(sampled.ravel(order="F"), pose)[4].full().ravel()
+        residual, _, _, conjugate_points, drift = newton(sampled.ravel(order="F"), pose, *known)[4].full().ravel()
         if not (residual < _RESOLVED and abs(drift) < _RESOLVED):
             raise ConvergenceError(
                 f"a rod is too taut for {segments} segments: its state drifts by {abs(drift):.1e} along the sweep "
@@ -116,7 +127,7 @@ def distance_to_fold(eq: Equilibrium, p_end: Any, q_end: Any, tolerance: float =
     p_end, q_end = checked_vector("p_end", p_end, 2), checked_vector("q_end", q_end, eq.robot.n_rods)
     if not eq.stable:
         return 0.0
-    solver = RodSolver(eq.robot, closed_form_method())
+    solver = free_solver(eq.robot)
     solver.start(eq.p, eq.q, eq.nodes)
     done, step = 0.0, 1.0 / 32.0
     while done < 1.0 and step > tolerance:
@@ -162,7 +173,10 @@ def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0
     ------
     UnreachableError
         The held tip is out of reach.
+    ModelError
+        The rods are not plain: the chart of stable shapes is of plain rods.
     """
+    require_plain(robot, "all_equilibria")
     q, force = checked_vector("q", q, robot.n_rods), checked_vector("force", force, 2)
     if p is not None:
         p = checked_vector("p", p, 2)

@@ -13,6 +13,7 @@ from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod import SCHEMES
 from .rod_method import Shooting, closed_form_method, shooting_method
+from .rod_physics import require_plain
 from .rod_solver import RodSolver
 from .single_shooting import SingleShooting
 
@@ -22,6 +23,7 @@ _REFINEMENT = (1, 4, 12)
 _WANTED_DRIFT = {"multiple_shooting": 1e-6, "single_shooting": 1e-9}
 # Below this slack, as a fraction of the length, less drift is wanted: a taut rod's force goes with 1/slack.
 _TAUT = 0.05
+_STRETCH = 5e-4  # least slack that counts for a rod that stretches
 # Integration steps along a rod for which a graph may be built: half a minute and 1 GB.
 _MOST_STEPS = 1024
 METHODS = ("closed_form", "multiple_shooting", "single_shooting")
@@ -32,7 +34,7 @@ def solve_statics(
     p: Any,
     q: Any,
     *,
-    method: str = "closed_form",
+    method: str | None = None,
     segments: int = 8,
     steps: int | None = None,
     scheme: str = "rk8",
@@ -47,8 +49,10 @@ def solve_statics(
         Tip position in the world frame [m].
     q : array_like, shape (n,)
         Motor angles, counter-clockwise from world x [rad].
-    method : {"closed_form", "multiple_shooting", "single_shooting"}
-        Exact; paper sec. 4; or the baseline of sec. 2, which uses segments * steps integration steps.
+    method : {"closed_form", "multiple_shooting", "single_shooting"}, optional
+        Exact for plain rods; paper sec. 4, for all rods; or the baseline of sec. 2 for plain ones, which uses
+        segments * steps integration steps. None: the closed form where it holds (see `Robot.needs_shooting`), else
+        multiple shooting.
     segments : int
         Shooting segments per rod (N).
     steps : int, optional
@@ -82,6 +86,7 @@ def solve_statics(
     """
     p, q = checked_vector("p", p, 2), robot.checked_angles("q", q)
     robot.require_reachable(p)
+    method = method or default_method(robot)
     shooting = checked_shooting(segments, 1 if steps is None else steps, scheme)
     if steps is None and method in _WANTED_DRIFT:
         return _refined(robot, p, q, method, segments, guess)
@@ -104,7 +109,11 @@ def _refined(
 ) -> Equilibrium:
     """Solve with finer and finer integration until the drift says that the rods are resolved."""
     failure: ConvergenceError | None = None
-    wanted = _WANTED_DRIFT[method] * min(1.0, min(robot.slacks(p)) / _TAUT)
+    # A rod that stretches is no stiffer than its EA: there is no end to the slack that counts.
+    slack = min(
+        max(slack, _STRETCH if rod.stretches else 0.0) for slack, rod in zip(robot.slacks(p), robot.rods, strict=True)
+    )
+    wanted = _WANTED_DRIFT[method] * min(1.0, slack / _TAUT)
     for steps in _REFINEMENT:
         if segments * steps > _MOST_STEPS:
             break
@@ -125,6 +134,11 @@ def _refined(
         )
     assert failure is not None
     raise failure
+
+
+def default_method(robot: Robot) -> str:
+    """Return the name of the method that is exact for the robot's rods."""
+    return "closed_form" if robot.needs_shooting is None else "multiple_shooting"
 
 
 def checked_shooting(segments: int, steps: int, scheme: str) -> Shooting:
@@ -150,10 +164,11 @@ def make_solver(robot: Robot, method: str, shooting: Shooting, *, snapping: bool
     if method == "closed_form":
         return RodSolver(robot, closed_form_method(), snapping=snapping)
     if method == "multiple_shooting":
-        return RodSolver(robot, shooting_method(shooting), snapping=snapping)
+        return RodSolver(robot, shooting_method(shooting, robot), snapping=snapping)
     if method == "single_shooting":
         if snapping:
             raise ValueError("single shooting does not notice where a branch ends: on_snap='jump' needs another method")
+        require_plain(robot, "method 'single_shooting'")
         return SingleShooting(robot, shooting.segments * shooting.steps, shooting.scheme)
     raise ValueError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
 

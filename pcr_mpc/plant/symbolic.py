@@ -14,6 +14,7 @@ from .elastica import beyond_limit, pendulum
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod_method import closed_form_method
+from .rod_physics import require_plain
 from .rod_solver import RodSolver
 
 
@@ -37,6 +38,7 @@ def symbolic_dynamics(robot: Robot, hands: tuple[float, ...]) -> Any:
         residual (2n) = (tip of the rod - p) / L, beyond (n): 1 where a rod is past its limit of stability with
         the tip held, else 0).
     """
+    require_plain(robot, "symbolic_dynamics")
     n = robot.n_rods
     if len(hands) != n or any(abs(hand) != 1.0 for hand in hands):
         raise ValueError(f"hands is {hands}, expected +1 or -1 for each of {n} rods")

@@ -70,7 +70,7 @@ def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
 
 def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
     """Rods at some of the run's states, followed from one to the next."""
-    plant = Plant(run.scene.robot, method="closed_form", dt=run.dt)
+    plant = Plant(run.scene.robot, dt=run.dt)
     plant.reset(run.x[0], run.pose)
     wanted = set(indices.tolist())
     # The branch is followed through every tenth state, not jumped to.

@@ -1,0 +1,72 @@
+"""What the rods of a robot have beyond the plain rod, as the numbers that the shooting graphs take."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from ..errors import ModelError
+from ..frozen import read_only
+from .robot import Robot, Rod
+from .rod import Layout, RodPhysics
+
+_MOST_INTERVALS = 128
+
+
+@lru_cache(maxsize=64)
+def robot_physics(robot: Robot) -> tuple[RodPhysics, ...] | None:
+    """Physics of each rod, all of one layout; None if all rods are plain and the closed form holds.
+
+    Raises
+    ------
+    ModelError
+        The lists along the rods have no common grid of a reasonable size.
+    """
+    if robot.needs_shooting is None:
+        return None
+    lists = [values for rod in robot.rods for values in (rod.curvatures, rod.stiffness_factors)]
+    intervals = math.lcm(*(max(1, len(values) - 1) for values in lists))
+    # Properties that do not change along the rods need one knot, which `interpolated` takes for a constant.
+    constant = all(len(set(values)) == 1 for values in lists)
+    if intervals > _MOST_INTERVALS:
+        raise ModelError(
+            f"{robot.name}: lists of {sorted({len(values) for values in lists})} values along the rods have no common "
+            f"grid of at most {_MOST_INTERVALS} intervals; give lists of equal length",
+            key="curvature",
+        )
+    layout = Layout(0 if constant else intervals, any(set(rod.stiffness_factors) != {1.0} for rod in robot.rods))
+    return tuple(_of_rod(rod, robot.gravity, layout) for rod in robot.rods)
+
+
+def require_plain(robot: Robot, what: str) -> None:
+    """Raise `ModelError` if ``what``, which holds for plain rods only, is asked of others."""
+    if robot.needs_shooting is not None:
+        raise ModelError(
+            f"{what} is for uniform, straight, inextensible, weightless rods, and {robot.needs_shooting}; "
+            "use method 'multiple_shooting'",
+            reason=robot.needs_shooting,
+        )
+
+
+def plain_physics(layout: Layout) -> np.ndarray:
+    """Values of a plain rod in a layout: where a continuation to the real rod begins."""
+    values = np.zeros(layout.size)
+    if layout.varying:
+        values[-(layout.intervals + 1) :] = 1.0
+    return values
+
+
+def _of_rod(rod: Rod, gravity: tuple[float, float], layout: Layout) -> RodPhysics:
+    length, ei = rod.length, rod.bending_stiffness
+    weight = rod.line_density * length**3 / ei * np.array(gravity)
+    curvature = length * _at_knots(rod.curvatures, layout.intervals)
+    stiffness = _at_knots(rod.stiffness_factors, layout.intervals) if layout.varying else np.empty(0)
+    compliance = ei / (length**2 * rod.axial_stiffness)
+    return RodPhysics(layout, read_only(np.concatenate([weight, [compliance], curvature, stiffness])))
+
+
+def _at_knots(values: tuple[float, ...], intervals: int) -> np.ndarray:
+    given = np.linspace(0.0, 1.0, len(values)) if len(values) > 1 else np.zeros(1)
+    return np.interp(np.linspace(0.0, 1.0, intervals + 1), given, values)
