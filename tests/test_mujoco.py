@@ -231,7 +231,7 @@ def test_a_model_with_the_rods_inertia_drives_it_better():
         tuning = replace(scene.tuning, model=replace(scene.tuning.model, inertia=inertia))
         plant = MuJoCoPlant(scene.robot, dt=scene.plant.dt, substeps=1)
         errors[inertia] = simulate(scene, plant, make_controller(scene, tuning)).summary()["rms_after_1s_mm"]
-    assert errors["none"] < 0.02
+    assert errors["none"] < 0.03
     assert errors["condensed"] < 0.7 * errors["none"]
 
 

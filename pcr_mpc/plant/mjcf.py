@@ -8,6 +8,7 @@ from ..errors import ModelError
 from .equilibrium import Equilibrium
 from .hinge_chain import ChainState, settled_chains
 from .robot import Robot, Rod
+from .rod_physics import require_plain
 
 # A pin is a soft constraint: a critically damped spring of this time constant [s] and of MuJoCo's largest impedance,
 # stiff enough for a gap of less than a micrometre, and implicit in the integrator, so that no time step is too long.
@@ -22,6 +23,7 @@ def checked_links(robot: Robot, links: int) -> int:
     """Return the number of links, or say what keeps the robot from being chains of so many."""
     if isinstance(links, bool) or not isinstance(links, int | np.integer) or not 2 <= links <= _MOST_LINKS:
         raise ValueError(f"links = {links!r} must be a whole number from 2 to {_MOST_LINKS}")
+    require_plain(robot, "the model for MuJoCo")
     for i, rod in enumerate(robot.rods):
         if rod.line_density == 0.0:
             raise ModelError(
