@@ -110,7 +110,7 @@ def build(label: str, case: Case) -> Controller:
 
 
 def measure(name: str, case: Case, label: str) -> dict[str, Any]:
-    """One row: error [mm], time of a step [ms], and how the answers came about."""
+    """One row: error [mm], CPU time of a step [ms], and how the answers came about."""
     failure = ""
     try:
         controller = build(label, case)
@@ -128,7 +128,7 @@ def measure(name: str, case: Case, label: str) -> dict[str, Any]:
         "controller": label,
         "rms_mm": float(np.sqrt(np.mean(error_mm**2))),
         "max_mm": float(error_mm.max()),
-        **{f"step_{key}_ms": (summary["control_step_us"][key] or math.nan) / 1e3 for key in ("p50", "p99", "max")},
+        **{f"step_{key}_ms": (summary["control_cpu_us"][key] or math.nan) / 1e3 for key in ("p50", "p99", "max")},
         "fallbacks": " ".join(f"{rung}:{count}" for rung, count in rungs.items()),
         "limit_violations": summary["limit_violations"],
         "failure": failure,
@@ -158,7 +158,7 @@ def plot(rows: list[dict[str, Any]], found: dict[str, Case], path: Path) -> None
     for at in axes[:, 0]:
         at.set_ylabel("RMS tracking error [mm]")
     for at in axes[1]:
-        at.set_xlabel("time per control step, p50 to p99 [ms]")
+        at.set_xlabel("CPU time per control step, p50 to p99 [ms]")
     handles = [plt.Line2D([], [], color=c, marker=m, ls="-", ms=8, label=label)
                for label, (_, c, m) in CONTROLLERS.items()]  # fmt: skip
     last = axes.flat[len(panels)] if len(panels) < axes.size else None

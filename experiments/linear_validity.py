@@ -41,6 +41,7 @@ from pcr_mpc import (
     linearise,
     load_robot,
     load_scene,
+    load_tuning,
     make_controller,
     simulate,
     solve_statics,
@@ -467,6 +468,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     robot, scene = load_robot(MODELS / "planar_pair.toml"), load_scene(MODELS / "scenes" / "lemniscate.toml")
+    # The question is about one linear model for the whole horizon.
+    scene = scene.tuned(load_tuning(MODELS.parent / "controllers" / "frozen.toml"))
     quick = options.quick
     spacing = 0.15 if quick else 0.02
     map_rows = measure_map(robot, spacing)
