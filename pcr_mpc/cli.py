@@ -27,7 +27,6 @@ from .loop.timing import time_scene
 from .loop.tracking import make_controller
 from .loop.tuning_file import default_path, write_tuning
 from .loop.tuning_study import Search, finished_trials, tune
-from .plant.dynamics import Plant
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
 from .plant.mjcf import mjcf
@@ -164,6 +163,8 @@ def _track(options: argparse.Namespace) -> int:
     tuning = load_tuning(options.controller) if options.controller else None
     if tuning and scene.trajectory is None:
         raise ValueError(f"scene {scene.name} has nothing to track, so --controller has no use")
+    if tuning:
+        scene = scene.tuned(tuning)
     if options.plant and options.method:
         raise ValueError("--method has no use with --plant: MuJoCo solves no statics")
     if options.links is not None and not options.plant:
@@ -172,9 +173,7 @@ def _track(options: argparse.Namespace) -> int:
     if options.plant:
         plant = MuJoCoPlant(scene.robot, links=_LINKS if options.links is None else options.links, dt=scene.plant.dt)
     elif options.method:
-        settings = scene.plant
-        plant = Plant(scene.robot, method=options.method, segments=settings.segments, steps=settings.steps,
-                      scheme=settings.scheme, integrator=settings.integrator, dt=settings.dt)  # fmt: skip
+        plant = replace(scene, plant=replace(scene.plant, method=options.method)).make_plant()
     folder = options.out or Path("results") / scene.name
     folder.mkdir(parents=True, exist_ok=True)  # rather now than after the run
     failure: SimulationError | None = None

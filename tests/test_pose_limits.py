@@ -191,6 +191,7 @@ def test_the_controller_does_not_drive_through_a_fold(pair):
         duration=2.5,
         trajectory=PickAndPlace((0.0, 0.25), (0.0, 0.02), 0.0, 0.2, 1.5),
         force=(5.0, 5.0),
+        tuning=load_tuning(CONTROLLERS / "frozen.toml"),
         pose_limits=PoseLimits(),
     )
     with pytest.raises(SimulationError, match="its branch ends"):
@@ -200,7 +201,7 @@ def test_the_controller_does_not_drive_through_a_fold(pair):
     plant = Plant(robot)
     plant.reset(found.x[0], found.pose)
     verdicts = [assess_stability(plant.equilibrium(x)) for x in found.x[::10]]
-    assert min(v.stiffness_eigenvalues[0] for v in verdicts) > 15.0
+    assert min(v.stiffness_eigenvalues[0] for v in verdicts) > 18.0
     assert min(v.rod_margins.min() for v in verdicts) > 0.095
     assert found.summary()["active_limits"]["stiffness"] > 50
 

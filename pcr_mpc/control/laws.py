@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
@@ -38,22 +39,23 @@ class Law(Protocol):
         """Motor rates where there is no model or no measurement."""
 
 
-class _OneStep:
+class _OneStep(ABC):
     """Rates for one period, clipped to the motors' limits; what poses are to keep is ignored."""
 
     def __init__(self, tuning: Tuning, limits: Limits) -> None:
         self.tuning = tuning
         self.limits = limits
 
-    def reset(self) -> None:
+    def reset(self) -> None:  # noqa: B027  it remembers nothing
         """See `Law`."""
 
     def prepare(self, model: LinearModel, combinations: Sequence[tuple[str, ...]] = ()) -> None:
         """See `Law`."""
         self._dt = model.dt
 
+    @abstractmethod
     def _rates(self, x: np.ndarray, reference: Reference) -> np.ndarray:
-        raise NotImplementedError
+        """Wanted rates, before they are clipped."""
 
     def solve(
         self,

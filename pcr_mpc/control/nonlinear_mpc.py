@@ -201,6 +201,7 @@ class NonlinearMPC:
             dual_residual=solution.dual_residual if solution else np.nan,
             update_time=times[0],
             solve_time=times[1],
+            solver_time=times[1],
         )
         return self._last
 
