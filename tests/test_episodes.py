@@ -115,9 +115,9 @@ def test_the_reference_is_solved_once_and_is_the_same(scene, monkeypatch):
     """For all episodes of a scene, whatever else is tuned; a run that solves it by itself is equal bit for bit."""
     solved = []
 
-    def counting(believed, robot, pose, horizon):
+    def counting(believed, robot, pose, horizon, inertia):
         solved.append(horizon)
-        return feed_forward(believed, robot, pose, horizon)
+        return feed_forward(believed, robot, pose, horizon, inertia)
 
     monkeypatch.setattr(episodes, "feed_forward", counting)
     scene = replace(scene, duration=0.11, delay=1)  # of no other test
@@ -129,7 +129,8 @@ def test_the_reference_is_solved_once_and_is_the_same(scene, monkeypatch):
     assert first.hash() == third.hash() == by_itself.hash()
     simulate_episode(scene, replace(scene.tuning, period=0.005), 0)
     simulate_episode(replace(scene, trajectory=Hold((0.0, 0.25))), scene.tuning, 0)
-    assert len(solved) == 3
+    simulate_episode(scene, replace(scene.tuning, model=replace(scene.tuning.model, inertia="constant")), 0)
+    assert len(solved) == 4
 
 
 def test_a_reference_that_is_too_short_is_refused(scene):

@@ -190,7 +190,8 @@ def simulate_episode(
     true = replace(mismatch, delay=delay).applied_to(believed)
     reference = None
     if believed.trajectory is not None:
-        reference = _reference(replace(believed, tuning=None), tuning.horizon + believed.delay)
+        tail = tuning.horizon + believed.delay
+        reference = _reference(replace(believed, tuning=None), tail, tuning.model.inertia)
     controller = make_controller(
         replace(believed, angle_step=true.angle_step), robot=believed.robot, reference=reference
     )
@@ -198,9 +199,9 @@ def simulate_episode(
 
 
 @lru_cache(maxsize=8)
-def _reference(believed: Scene, horizon: int) -> InverseDynamics:
+def _reference(believed: Scene, horizon: int, inertia: str) -> InverseDynamics:
     """Inverse dynamics of the reference: what is believed is the same in all episodes, so they are solved once."""
-    return feed_forward(believed, believed.robot, believed.start(), horizon)
+    return feed_forward(believed, believed.robot, believed.start(), horizon, inertia)
 
 
 def run_episode(scene: Scene, tuning: Tuning, seed: int, spread: Spread = Spread()) -> Row:

@@ -74,7 +74,8 @@ class TrackingController:
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
-        self._reference = self._known or feed_forward(self._scene, self.robot, pose, self._tuning.horizon + self._delay)
+        tail, inertia = self._tuning.horizon + self._delay, self._tuning.model.inertia
+        self._reference = self._known or feed_forward(self._scene, self.robot, pose, tail, inertia)
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         if self._law is None:
             self._law = self._make_law(pose)
