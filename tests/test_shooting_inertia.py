@@ -5,36 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import Plant, forward_statics, inverse_statics, linearise, load_robot, solve_statics
+from pcr_mpc import Plant, forward_statics, linearise
 from pcr_mpc.plant import elastica, inertia, shooting_inertia
 
-from .conftest import MODELS
 from .test_inertia import kinetic_energy, rollout, started, state
-
-
-@pytest.fixture(scope="module")
-def general(pair):
-    """Weight, curvature, varying stiffness and stretch at once, and different for the two rods."""
-    rods = (
-        replace(pair.rods[0], curvature=(0.5, 1.0, 0.3), stiffness_factors=(1.2, 1.0, 0.7), axial_stiffness=5e3),
-        replace(pair.rods[1], curvature=-0.8, stiffness_factors=(1.0, 0.8), line_density=0.1),
-    )
-    return replace(pair, gravity=(2.0, -9.81), rods=rods)
-
-
-@pytest.fixture(scope="module")
-def bent(general):
-    return solve_statics(general, (0.01, 0.24), (3.2, 0.1))
-
-
-@pytest.fixture(scope="module")
-def heavy():
-    return load_robot(MODELS / "heavy_pair.toml")
-
-
-@pytest.fixture(scope="module")
-def sagging(heavy):
-    return inverse_statics(heavy, (0.0, 0.25), mode="LR")
 
 
 def test_plain_rods_have_the_inertia_of_the_closed_form(poses, monkeypatch):

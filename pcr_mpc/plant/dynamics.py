@@ -112,8 +112,8 @@ class Plant:
         method = method or default_method(rods)
         if weight == "condensed" and method != "closed_form":
             raise ValueError(f"weight='condensed' needs method='closed_form', not {method!r}; take weight='exact'")
-        if weight != "none" and inertia == "full":
-            raise ValueError(f"inertia='full' has weightless rods, not weight={weight!r}; take weight='none'")
+        if weight == "condensed" and inertia == "full":
+            raise ValueError("inertia='full' does not condense the rods' weight; take weight='exact' or 'none'")
         if inertia != "none" and method == "single_shooting":
             raise ValueError(f"inertia={inertia!r} needs method='closed_form' or 'multiple_shooting', not {method!r}")
         if not 0.0 < dt < np.inf:
@@ -127,7 +127,7 @@ class Plant:
         self.integrator = integrator
         self.dt = dt
         self.n_states = 4 + robot.n_rods
-        self._modal = ModalStep(robot, int(modes)) if inertia == "full" else None
+        self._modal = ModalStep(rods, int(modes)) if inertia == "full" else None
         self._advance = self._modal or INTEGRATORS[integrator](robot.n_rods)
         self._mass_moves = inertia in ("condensed", "full")
         self._solver = make_solver(rods, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
