@@ -161,8 +161,9 @@ def _moved(
         parts.append(x)
         verdicts.append(verdict)
     verdict = np.concatenate(verdicts, axis=1)
-    good = np.all(verdict <= limits(model), axis=(1, 2))
-    return np.concatenate(parts, axis=1), verdict[:, :, 0], np.asarray(good)
+    x = np.concatenate(parts, axis=1)
+    good = np.all(verdict <= limits(model), axis=(1, 2)) & np.isfinite(x).all(axis=(1, 2))
+    return x, verdict[:, :, 0], np.asarray(good)
 
 
 @lru_cache(maxsize=16)

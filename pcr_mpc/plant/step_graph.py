@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from ..compiled import compiled as machine_code
-from .inertia import robot_mass
 from .integrators import RK4_STAGES, euler_graph, first_half_graph, second_half_graph, stage_graph, stop_graph
+from .mass_matrix import robot_mass
 from .robot import Robot
 from .rod_follower import BRANCH_CHANGE
 from .rod_method import RodMethod, warm_step
@@ -108,7 +108,7 @@ class _Motion:
         if model.weighed:
             self.force += robot_weight(model.robot)[0](unknowns, q)[1][:2]
         if model.inertia == "condensed":
-            self._mass = tuple(robot_mass(model.robot)(unknowns, q))
+            self._mass = tuple(robot_mass(model.robot, model.method)(unknowns, q))
 
     def memory(self) -> Any:
         """What the next step starts from."""
@@ -164,8 +164,10 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
         on top of the tip's weight. The verdict is that of `warm_step`, added up over the solves of the step.
     """
     robot, n, dt = model.robot, model.robot.n_rods, model.dt
-    warm = warm_step(model.rods, model.method, corrections)
-    symbol: Any = (ca.SX if warm.is_a("SXFunction") else ca.MX).sym
+    graphs = [warm_step(model.rods, model.method, corrections)]
+    if model.inertia == "condensed":
+        graphs.append(robot_mass(robot, model.method))
+    symbol: Any = (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym
     memory, x, given = symbol("memory", sum(model.widths)), symbol("x", 4 + n), symbol("given", n + 2)
     u, f_ext = given[:n], given[n:]
     # As Robot.motor_rates.
