@@ -315,3 +315,15 @@ def test_endless_links_are_the_distributed_rods(pair, displaced):
         states = released(pair, displaced, (0.0, 0.0), seconds=1.0, dt=1e-3, inertia=inertia, integrator=integrator)
         assert distance(states, endless) < largest
     assert distance(states, endless) > 0.3
+
+
+@pytest.mark.slow
+def test_endless_links_are_the_distributed_rods_that_sag(heavy, sagging):
+    chains = [in_mujoco(heavy, sagging, seconds=1.0, links=links) for links in (40, 80)]
+    endless = (4 * chains[1] - chains[0]) / 3
+    errors = [
+        distance(released(heavy, sagging, seconds=1.0, dt=1e-3, inertia=inertia, integrator=integrator), endless)
+        for inertia, integrator in (("full", "gauss"), ("condensed", "rk4"), ("none", "rk4"))
+    ]
+    assert errors[0] < 0.01 < errors[1] < 0.06
+    assert errors[2] > 20.0
