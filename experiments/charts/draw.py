@@ -1,129 +1,95 @@
-"""The three charts: error up the axis, time to the right, what no other point beats on a dashed line."""
+"""What the three charts have in common: error up the axis, time to the right, the best on a dashed line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from experiments.charts.points import Row, failures, front
-from experiments.charts.statics import DERIVATIVES
-from experiments.charts.statics_poses import CLASSES
-from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt
+from pcr_mpc.report.style import GREY, plt
 
 Style = tuple[str, str, float]  # colour, marker, size
-STATICS: dict[str, Style] = {
-    "closed form": (GREEN, "*", 13),
-    "multiple shooting, rk8": (BLUE, "s", 5),
-    "multiple shooting, rk4": (SKY, "o", 5),
-    "single shooting, SciPy": (ORANGE, "^", 6),
-    "literal reading, at once": (PURPLE, "v", 6),
-    "literal reading": (RED, "D", 6),
-}
 
 
-def draw_statics(rows: list[Row], path: Path) -> None:
-    """Draw a panel for each class, one for the derivatives, and the legend."""
-    figure, axes = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
-    for panel, case in zip(axes.flat, (*CLASSES, DERIVATIVES), strict=False):
-        mine = [row for row in rows if row["case"] == case]
-        attempts = max((row["attempts"] for row in mine), default=0)
-        panel.set(title=f"{case} ({attempts} poses)", xlabel="time of a solve, p50 [ms]")
-        if case == DERIVATIVES:
-            panel.set(ylabel="relative error, median [-]")
-            _ways(panel, mine)
-        else:
-            panel.set(ylabel="relative error of F, median [-]")
-            _draw(panel, mine, STATICS, _family, 1e3, label=_segments)
-            _front(panel, mine, 1e3)
-        panel.set(xscale="log", yscale="log", xlim=(1e-3 if case == DERIVATIVES else 1e-2, 1e4), ylim=(1e-15, 1e2))
-        panel.minorticks_off()
-    _legend(axes.flat[-1], {name: style for name, style in STATICS.items() if any(_family(r) == name for r in rows)},
-            "lines of multiple shooting: N segments (number)\nof 1 to 16 steps of rk4, 1 to 4 of rk8")  # fmt: skip
-    figure.savefig(path)
-    plt.close(figure)
+@dataclass(frozen=True)
+class Look:
+    """How the points of a level are drawn.
+
+    Attributes
+    ----------
+    styles : dict
+        Family -> colour, marker, size.
+    family : callable
+        Row -> family.
+    line : callable
+        Row -> which points of a family are joined; "" for none.
+    tag : callable
+        Row -> text beside the point, or "".
+    unit : float
+        Of the axis of time, per second.
+    bars : bool
+        Lines from p50 to p99.
+    """
+
+    styles: dict[str, Style]
+    family: Callable[[Row], str]
+    line: Callable[[Row], str]
+    tag: Callable[[Row], str]
+    unit: float
+    bars: bool = False
 
 
-def _family(row: Row) -> str:
-    name = str(row["method"])
-    return f"{name}, {row['settings'].split()[-1]}" if name == "multiple shooting" else name
-
-
-def _segments(row: Row) -> str:
-    """Which points are joined: those with as many segments, and none of the literal reading."""
-    return str(row["settings"] if row["method"].startswith("literal") else row["settings"].split(",")[0])
-
-
-def _ways(panel: Any, rows: list[Row]) -> None:
-    """What F, K and G cost: by name beside each point."""
-    for row in rows:
-        if np.isfinite(row["time_p50"]):
-            colour, marker, size = STATICS[_family(row) if row["method"] != "multiple shooting" else
-                                           "multiple shooting, rk8"]  # fmt: skip
-            way = row["settings"].split(", ")[-1]
-            at = 1e3 * row["time_p50"], row["error"]
-            panel.plot(*at, marker, color=colour, ms=size)
-            text = {"implicit": "K, G implicit", "differences": "K, G by differences"}.get(way, way)
-            # On sides where the other points are not.
-            offset, ha, va = {
-                "implicit": ((0, 8), "center", "bottom"),
-                "differences": ((8, 0), "left", "center"),
-            }.get(way, ((-8, 0), "right", "center"))
-            if row["method"].startswith("literal"):
-                offset, ha = (-8, 0), "right"
-            style = {"textcoords": "offset points", "fontsize": 8, "color": colour}
-            panel.annotate(text, at, offset, ha=ha, va=va, **style)
-
-
-def _draw(
-    panel: Any,
-    rows: list[Row],
-    styles: dict[str, Style],
-    family: Callable[[Row], str],
-    unit: float,
-    *,
-    label: Callable[[Row], str],
-    floor: float = 0.0,
-) -> None:
-    """Points of all rows, joined where method and label are the same; failures as a number beside a hollow marker."""
-    lines: dict[tuple[str, str], list[Row]] = {}
+def draw_points(panel: Any, rows: list[Row], look: Look, floor: float = 0.0) -> None:
+    """Draw all rows; those that claim less than the floor lie on it, with a black rim."""
+    lines: dict[tuple[str, str], list[tuple[float, float]]] = {}
     lost: dict[str, int] = {}
     for row in rows:
-        if np.isfinite(row["time_p50"]) and np.isfinite(row["error"]):
-            lines.setdefault((family(row), label(row)), []).append(row)
-        else:
-            lost[family(row)] = lost.get(family(row), 0) + 1
-    for (name, text), found in lines.items():
-        colour, marker, size = styles[name]
-        x = [unit * row["time_p50"] for row in found]
-        y = [max(row["error"], floor) for row in found]
-        panel.plot(x, y, "-", color=colour, lw=0.8, alpha=0.6)
-        for row, at in zip(found, zip(x, y, strict=True), strict=True):
-            failed = failures(row)
-            panel.plot(*at, marker, color=colour, ms=size, mfc="none" if failed else colour)
-            if failed:
-                panel.annotate(f"-{failed}", at, (-4, -9), textcoords="offset points", fontsize=7, color=colour,
-                               ha="right")  # fmt: skip
-        if name == "multiple shooting, rk4":
-            panel.annotate(text.split()[-1], (x[-1], y[-1]), (5, -3), textcoords="offset points", fontsize=8)
+        family = look.family(row)
+        x, y = look.unit * row["time_p50"], max(row["error"], floor)
+        if not row["success"] or not np.isfinite([x, y]).all():
+            lost[family] = lost.get(family, 0) + 1
+            continue
+        colour, marker, size = look.styles[family]
+        if look.line(row):
+            lines.setdefault((family, look.line(row)), []).append((x, y))
+        if look.bars:
+            panel.plot([x, look.unit * row["time_p99"]], [y, y], "-", color=colour, lw=1, alpha=0.5)
+        failed = failures(row)
+        rim = {"mec": "black", "mew": 1.2} if row["error"] < floor else {}
+        panel.plot(x, y, marker, color=colour, ms=size, mfc="none" if failed else colour, **rim)
+        style = {"textcoords": "offset points", "fontsize": 7.5}
+        if failed:
+            panel.annotate(f"-{failed}", (x, y), (-4, -9), color=colour, ha="right", **style)
+        if look.tag(row):
+            panel.annotate(look.tag(row), (x, y), (3, 4), **style)
+    for (family, _), at in lines.items():
+        panel.plot(*zip(*sorted(at), strict=True), "-", color=look.styles[family][0], lw=0.8, alpha=0.6)
     if lost:
         text = "\n".join(f"{name} ({count})" for name, count in lost.items())
         panel.annotate(f"failed throughout (settings):\n{text}", (0.98, 0.98), xycoords="axes fraction", ha="right",
                        va="top", fontsize=7.5, color=GREY)  # fmt: skip
 
 
-def _front(panel: Any, rows: list[Row], unit: float, floor: float = 0.0) -> None:
-    best = list(front(rows))
-    x, y = [unit * row["time_p50"] for row in best], [max(row["error"], floor) for row in best]
+def draw_front(panel: Any, rows: list[Row], unit: float, floor: float = 0.0) -> None:
+    """Join the points that no other beats; what lies below the floor has a place there once."""
+    best = list(front([row | {"error": max(row["error"], floor)} for row in rows]))
+    x, y = [unit * row["time_p50"] for row in best], [row["error"] for row in best]
     panel.step(x, y, where="post", color=GREY, ls="--", lw=1.2, zorder=0)
 
 
-def _legend(panel: Any, styles: dict[str, Style], note: str, **place: Any) -> None:
-    handles = [plt.Line2D([], [], color=colour, marker=marker, ms=size, ls="", label=name)
-               for name, (colour, marker, size) in styles.items()]  # fmt: skip
+def draw_legend(panel: Any, rows: list[Row], look: Look, note: str, *, floor: bool = False) -> None:
+    """Families that are there, and the signs, in a panel of their own."""
+    there = {look.family(row) for row in rows}
+    handles = [plt.Line2D([], [], color=colour, marker=marker, ms=min(size, 9), ls="", label=name)
+               for name, (colour, marker, size) in look.styles.items() if name in there]  # fmt: skip
     handles.append(plt.Line2D([], [], color=GREY, ls="--", lw=1.2, label="beaten by no other, without failures"))
     handles.append(plt.Line2D([], [], color=GREY, marker="o", ls="", mfc="none", label="hollow, -n: n failures"))
+    if floor:
+        handles.append(plt.Line2D([], [], color=GREY, ls=":", lw=1.5, label="how well the yardstick is known"))
+        handles.append(plt.Line2D([], [], color=GREY, marker="o", ls="", mec="black", mew=1.2,
+                                  label="black rim: closer than that, drawn on it"))  # fmt: skip
     panel.axis("off")
-    panel.legend(handles=handles, loc="center", fontsize=10.5, title=note, title_fontsize=10, alignment="left", **place)
+    panel.legend(handles=handles, loc="center", fontsize=9.5, title=note, title_fontsize=9.5, alignment="left")

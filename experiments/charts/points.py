@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -60,10 +61,10 @@ def collect(
         In the order of ``keys``.
     """
     path = folder / f"accuracy_vs_speed_{level}.csv"
-    about = {"level": level, "machine": _machine(), "versions": _versions(), "commit": commit()}
+    common = {"level": level} | about()
     known: dict[Key, Row] = {}
-    if path.exists() and not fresh and not about["commit"].endswith("-dirty"):
-        known = {_key(row): row for row in read(path) if row["commit"] == about["commit"] and _key(row) in keys}
+    if path.exists() and not fresh and not common["commit"].endswith("-dirty"):
+        known = {_key(row): row for row in read(path) if row["commit"] == common["commit"] and _key(row) in keys}
     folder.mkdir(parents=True, exist_ok=True)
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=FIELDS, restval="")
@@ -73,10 +74,15 @@ def collect(
         bar = tqdm([key for key in keys if key not in known], desc=level, unit="point")
         for key in bar:
             bar.set_postfix_str(" ".join(key)[:60])
-            known[key] = about | dict(zip(("case", "method", "settings"), key, strict=True)) | measure(key)
+            known[key] = common | dict(zip(("case", "method", "settings"), key, strict=True)) | measure(key)
             writer.writerow(_text(known[key]))
             file.flush()
     return [known[key] for key in keys]
+
+
+def about() -> dict[str, str]:
+    """On what, with what and of which code something is measured."""
+    return {"machine": _machine(), "versions": _versions(), "commit": commit()}
 
 
 def read(path: Path) -> list[Row]:
@@ -126,8 +132,8 @@ def _parsed(row: Row) -> Row:
 
 
 def _machine() -> str:
-    found = machine()
-    return f"{_processor()}, {found['cores']} cores, load {found['load']:.1f} at the start"
+    found, threads = machine(), os.environ.get("OPENBLAS_NUM_THREADS", "all")
+    return f"{_processor()}, {found['cores']} cores, {threads} thread(s) in BLAS, load {found['load']:.1f} at the start"
 
 
 def _processor() -> str:
