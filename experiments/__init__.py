@@ -1,4 +1,4 @@
-"""Studies of the toolkit; each answers one question."""
+"""Studies: each answers one question, by measurement."""
 
 import os
 
