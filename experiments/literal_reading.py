@@ -93,9 +93,9 @@ class LiteralReading:
                 fit = least_squares(residual, guess, max_nfev=MOST_TRIALS)
             except ValueError as error:
                 raise ConvergenceError(
-                    f"literal reading at p = {p} m: {error}", residual=np.nan, iterations=0, last=guess
+                    f"literal reading at p = {p} m, q = {q} rad: {error}", residual=np.nan, iterations=0, last=guess
                 ) from None
-        norm = float(np.linalg.norm(fit.fun))
+            norm = float(np.linalg.norm(fit.fun))
         if not norm <= ACCEPTED_RESIDUAL:
             raise ConvergenceError(
                 f"literal reading at p = {p} m, q = {q} rad stopped with residual {norm:.1e}: {fit.message}",

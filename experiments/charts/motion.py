@@ -61,7 +61,7 @@ class Plan:
     steps: tuple[tuple[str, tuple[float, ...]], ...] = (
         ("semi_implicit_euler", (1e-4, 2.5e-4, 5e-4, 1e-3, 2e-3, 5e-3)),
         ("velocity_verlet", (1e-4, 2.5e-4, 5e-4, 1e-3, 2e-3, 5e-3)),
-        ("rk4", (5e-4, 1e-3, 2e-3, 5e-3)),
+        ("rk4", (5e-4, 1e-3, 2e-3, 5e-3, 1e-2)),
     )
     inertias: tuple[str, ...] = ("none", "constant", "condensed")
     full: tuple[tuple[int, float], ...] = ((6, 1e-3), (8, 1e-3), (8, 2e-3), (10, 1e-3), (12, 1e-3), (12, 2e-3))
