@@ -1,8 +1,9 @@
 """Has anything become slower, or less accurate? Ratios of ours to references measured in the same run.
 
 The references never change: the paper's text read literally (`literal_reading`, all segments at once) for the statics
-and the plant's step, IPOPT on the exact equations for control, massless rods for the inertia. So a ratio says more
-than a time on a computer that others use too. Every ratio is the reference over ours: the larger, the better.
+and the plant's step, IPOPT on the exact equations for control, massless rods for the inertia. Times are CPU times. So a
+ratio says more than a time on a computer that others use too. Every ratio is the reference over ours: the larger, the
+better.
 
 Prints the new ratios beside those of docs/benchmarks.json, and fails if one is worse than half of the old one, in a
 second measurement as well. --write puts the new ones there, with the commit, and prints the table for CHANGELOG.md.
@@ -23,16 +24,18 @@ from typing import Any
 import numpy as np
 
 from experiments.charts import statics
-from experiments.charts.motion import yardstick
+from experiments.charts.motion import swing, yardstick
 from experiments.charts.points import about
 from experiments.charts.statics import LITERAL_AT_ONCE
-from experiments.rod_inertia import STEP, furthest, start, swing
+from experiments.rod_inertia import STEP, furthest, start
 from pcr_mpc import Plant, Robot, linearise, load_robot, load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.report.tables import table
 
 ROOT = Path(__file__).parent.parent
 KEPT = ROOT / "docs" / "benchmarks.json"
 WORST = 0.5  # of the old ratio
+_POSES = statics.Plan(poses=8, literal_poses=4)
+_LITERAL = LITERAL_AT_ONCE, "N = 8, 4 x rk4"
 _DURATION = 0.1  # s of free motion
 
 
@@ -67,11 +70,10 @@ def measure() -> dict[str, float]:
 
 
 def _statics(robot: Robot) -> dict[str, float]:
-    plan = statics.Plan(poses=8, literal_poses=4)
     time_of = {
-        name: statics.measure(robot, plan, ("bent", *name))["time_p50"]
+        name: statics.measure(robot, _POSES, ("bent", *name), time.thread_time)["time_p50"]
         for name in (
-            (LITERAL_AT_ONCE, "N = 8, 4 x rk4"),
+            _LITERAL,
             ("closed form", "exact"),
             ("closed form", "exact, implicit"),
             ("multiple shooting", "N = 8, 1 x rk8"),
@@ -88,15 +90,14 @@ def _statics(robot: Robot) -> dict[str, float]:
 def _plant(robot: Robot) -> dict[str, float]:
     """Steps against one solve of the literal reading; errors against massless rods."""
     right = yardstick(robot, "displaced", _DURATION)[0][::2]
-    plan = statics.Plan(poses=8, literal_poses=4)
-    literal = statics.measure(robot, plan, ("bent", LITERAL_AT_ONCE, "N = 8, 4 x rk4"))["time_p50"]
+    literal = statics.measure(robot, _POSES, ("bent", *_LITERAL), time.thread_time)["time_p50"]
     pose, x = start(robot, "displaced")
     found, errors = {}, {}
     for inertia in ("none", "condensed"):
         plant = Plant(robot, inertia=inertia, integrator="velocity_verlet", dt=STEP)
-        tips, seconds = swing(plant, pose, x, _DURATION)
+        tips, seconds = swing(plant, pose, x, _DURATION, time.thread_time)
         errors[inertia] = furthest(tips, right)
-        found[f"plant step: literal reading / {inertia}"] = literal / float(np.median(seconds))
+        found[f"plant step: literal reading / {inertia}"] = literal / (STEP * float(np.median(seconds)))
     plant = Plant(robot)
     plant.reset(x, pose)
     linear = _median(lambda k: linearise(plant, x + 1e-4 * (k % 2), (0.0, 0.0), 0.01), 200)
@@ -122,9 +123,9 @@ def _control() -> dict[str, float]:
 def _median(call: Callable[[int], object], count: int) -> float:
     seconds = []
     for k in range(count):
-        began = time.perf_counter()
+        began = time.thread_time()
         call(k)
-        seconds.append(time.perf_counter() - began)
+        seconds.append(time.thread_time() - began)
     return float(np.median(seconds))
 
 

@@ -140,19 +140,25 @@ def yardstick(robot: Robot, release: str, duration: float) -> tuple[np.ndarray, 
     return tips, by_step + by_modes, times(seconds)
 
 
-def swing(plant: SimulatedPlant, pose: Equilibrium, x: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Tips after every step, shape (K + 1, 2) [m], and wall times of blocks, for a simulated second [s]."""
+def swing(
+    plant: SimulatedPlant,
+    pose: Equilibrium,
+    x: np.ndarray,
+    duration: float,
+    clock: Callable[[], float] = time.perf_counter,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tips after every step, shape (K + 1, 2) [m], and times of blocks, for a simulated second [s]."""
     plant.reset(x, pose)
     motors, per_block = np.zeros(pose.robot.n_rods), round(_BLOCK / plant.dt)
     plant.step(x, motors)  # warms up
     plant.reset(x, pose)
     tips, seconds = [x[:2]], []
     for _ in range(round(duration / _BLOCK)):
-        began = time.perf_counter()
+        began = clock()
         for _ in range(per_block):
             x = plant.step(x, motors)
             tips.append(x[:2])
-        seconds.append((time.perf_counter() - began) / _BLOCK)
+        seconds.append((clock() - began) / _BLOCK)
     return np.array(tips), np.array(seconds)
 
 
