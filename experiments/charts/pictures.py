@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.charts.control import DO_MPC, SCENES
+from experiments.charts.control import CROCODDYL, DO_MPC, SCENES
 from experiments.charts.draw import Look, Style, draw_front, draw_legend, draw_points
 from experiments.charts.motion import ELASTICA, MUJOCO, YARDSTICK
 from experiments.charts.points import Row
@@ -184,6 +184,7 @@ CONTROL = Look(
     | {
         "nonlinear": (RED, "D", 6),
         DO_MPC: (PURPLE, "P", 8),
+        CROCODDYL: (PURPLE, "X", 8),
         "lqr": (GREY, "^", 6),
         "pd": (GREY, "v", 6),
         "open loop": (GREY, "x", 6),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.charts.control import DO_MPC
+from experiments.charts.control import CROCODDYL, DO_MPC
 from experiments.charts.motion import ELASTICA, MUJOCO, YARDSTICK
 from experiments.charts.points import Row, failures
 from experiments.charts.statics import LITERAL, LITERAL_AT_ONCE
@@ -48,7 +48,8 @@ def ratios(rows: list[Row]) -> list[dict[str, Any]]:
         ours = _pick(rows, scene, file)
         horizon = ours["settings"].split(",")[0] if ours else ""
         found.append(_compared(scene, ours, _pick(rows, scene, DO_MPC, horizon), wanted=WANTED[DO_MPC]))
-        found.append(_compared(scene, ours, _pick(rows, scene, "nonlinear", horizon)))
+        for name in (CROCODDYL, "nonlinear"):
+            found.append(_compared(scene, ours, _pick(rows, scene, name, horizon)))
     return [one for one in found if one]
 
 
