@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..control.qp import Reference
 from ..control.tuning import Tuning
 from ..errors import SimulationError, checked_number
-from .feed_forward import feed_forward
+from .feed_forward import InverseDynamics, feed_forward
 from .run import Run
 from .scene import Scene
 from .simulate import simulate
@@ -200,7 +199,7 @@ def simulate_episode(
 
 
 @lru_cache(maxsize=8)
-def _reference(believed: Scene, horizon: int, inertia: str) -> Reference:
+def _reference(believed: Scene, horizon: int, inertia: str) -> InverseDynamics:
     """Inverse dynamics of the reference: what is believed is the same in all episodes, so they are solved once."""
     return feed_forward(believed, believed.robot, believed.start(), horizon, inertia)
 

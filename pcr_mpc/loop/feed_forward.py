@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..control.qp import Reference
@@ -18,7 +20,25 @@ _SETTLED = 1e-5
 _MOST_SWEEPS = 20
 
 
-def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, inertia: str = "none") -> Reference:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InverseDynamics(Reference):
+    """What the reference asks of the motors at K times from the start on.
+
+    Attributes
+    ----------
+    states : ndarray, shape (K, 4 + n)
+    inputs : ndarray, shape (K - 1, n)
+        Rates that lead from each state to the next [rad/s].
+    forces : ndarray, shape (K, 2)
+        That the rods carry [N].
+    angles_per_force : ndarray, shape (K, n, 2)
+        Least change of the motor angles by which they carry one more newton [rad/N].
+    """
+
+    angles_per_force: np.ndarray
+
+
+def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, inertia: str = "none") -> InverseDynamics:
     """Inverse dynamics of the reference at every period, and one horizon beyond the end.
 
     The motor angles are those at which the rods carry F = -m a - c v on the reference; the rates lead from
@@ -42,11 +62,6 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     inertia : {"none", "constant", "condensed"}
         Of the rods (see `Plant`).
 
-    Returns
-    -------
-    Reference
-        At K times from the start on: states (K, 4 + n), inputs (K - 1, n), forces (K, 2).
-
     Raises
     ------
     PCRError
@@ -56,30 +71,34 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     t = scene.period * np.arange(scene.n_periods + horizon + 1)
     p, v, a = np.moveaxis(scene.trajectory(t), 1, 0)
     forces = -robot.tip_mass * a - robot.drag * v
-    q = _angles(robot, pose, t, p, forces)
+    q, levers = _angles(robot, pose, t, p, forces)
     if inertia != "none":
         plant = Plant(robot, inertia=inertia)
         for _ in range(_MOST_SWEEPS):
             plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
             momentum, push, own = _momentum(plant, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
             forces = push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
-            before, q = q, _angles(robot, pose, t, p, forces)
+            before = q
+            q, levers = _angles(robot, pose, t, p, forces)
             if np.abs(q - before).max() < _SETTLED:
                 break
         v = own
-    return Reference(np.hstack([p, v, q]), np.diff(q, axis=0) / scene.period, forces)
+    rates = np.diff(q, axis=0) / scene.period
+    return InverseDynamics(np.hstack([p, v, q]), rates, forces, angles_per_force=levers)
 
 
-def _angles(robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray) -> np.ndarray:
-    """Motor angles at which the rods carry the forces at the tips p, shape (K, n) [rad]."""
-    angles, eq = np.empty((len(t), robot.n_rods)), pose
+def _angles(
+    robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motor angles at which the rods carry the forces at the tips p, and their least change per force (K, n, 2)."""
+    angles, levers, eq = np.empty((len(t), robot.n_rods)), np.empty((len(t), robot.n_rods, 2)), pose
     for k in range(len(t)):
         try:
             eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
             raise type(error)(f"reference at t = {t[k]:.3f} s: {error}", **error.details) from None
-        angles[k] = eq.q
-    return angles
+        angles[k], levers[k] = eq.q, np.linalg.pinv(eq.dforce_dq)
+    return angles, levers
 
 
 def _momentum(

@@ -26,7 +26,7 @@ from ..plant.robot import Robot
 from ..plant.symbolic import rod_unknowns, symbolic_dynamics
 from .along_plan import AlongPlan
 from .controllers import Controller, Decision, HoldMotors
-from .feed_forward import feed_forward
+from .feed_forward import InverseDynamics, feed_forward
 from .scene import Scene
 from .target import MotorTarget
 
@@ -41,13 +41,13 @@ class TrackingController:
     tuning : Tuning
     robot : Robot, optional
         What the controller believes the robot to be; by default the scene's.
-    reference : Reference, optional
+    reference : InverseDynamics, optional
         Inverse dynamics of the scene's reference for that robot, as `feed_forward` finds them, if they are known
         already: most of what a start costs.
     """
 
     def __init__(
-        self, scene: Scene, tuning: Tuning, robot: Robot | None = None, reference: Reference | None = None
+        self, scene: Scene, tuning: Tuning, robot: Robot | None = None, reference: InverseDynamics | None = None
     ) -> None:
         if scene.trajectory is None:
             raise ValueError(f"scene {scene.name} has no reference to track")
@@ -165,10 +165,11 @@ class TrackingController:
         states, inputs = reference.states[k + 1 : k + 1 + horizon], reference.inputs[k : k + horizon]
         forces = reference.forces[k + 1 : k + 1 + horizon]
         if self.observer is not None:
-            end = states[-1]
+            end, lever = states[-1], self._reference.angles_per_force[k + horizon]
             forces = forces + force
+            shift = self._target.small_shift(lever, force)
             states = states.copy()
-            states[:, 4:] += self._target.shift(end[:2], end[4:], forces[-1])
+            states[:, 4:] += self._target.shift(end[:2], end[4:], forces[-1]) if shift is None else shift
         return Reference(states, inputs, forces)
 
     def _make_model(self) -> Plant:
@@ -199,7 +200,7 @@ def motor_limits(robot: Robot, period: float) -> Limits:
 
 
 def make_controller(
-    scene: Scene, tuning: Tuning | None = None, robot: Robot | None = None, reference: Reference | None = None
+    scene: Scene, tuning: Tuning | None = None, robot: Robot | None = None, reference: InverseDynamics | None = None
 ) -> Controller:
     """Build the controller of a scene: that of its tuning, or none where there is nothing to track.
 
@@ -209,7 +210,7 @@ def make_controller(
         Instead of the scene's own.
     robot : Robot, optional
         What the controller believes the robot to be.
-    reference : Reference, optional
+    reference : InverseDynamics, optional
         Inverse dynamics that are known already (see `TrackingController`).
     """
     tuning = tuning or scene.tuning
