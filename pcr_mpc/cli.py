@@ -153,8 +153,8 @@ def _parser() -> argparse.ArgumentParser:
     tuning.add_argument("--jobs", type=int, default=1, help="processes on this machine (default 1)")
     tuning.add_argument("--storage", metavar="URL", help="Optuna storage, for several machines "
                       "(default SQLite in results/tune/SCENE)")  # fmt: skip
-    tuning.add_argument("--episodes", type=int, default=24, help="with mismatch, in each trial (default 24: a study "
-                        "that sees none of the failures, which are rare, takes a fragile tuning for the best)")  # fmt: skip
+    tuning.add_argument("--episodes", type=int, default=24, help="with mismatch, in each trial (default 24: a "
+                        "study that sees no failure, which is rare, takes a fragile tuning for the best)")  # fmt: skip
     tuning.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
     tuning.add_argument(
         "--out", type=Path, metavar="FILE", help="tuning to write (default SCENE.toml beside the scene's)"
