@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.charts.control import CROCODDYL, DO_MPC, SCENES
 from experiments.charts.draw import Look, Style, draw_front, draw_legend, draw_points
@@ -74,6 +75,9 @@ def draw_control(rows: list[Row], path: Path) -> None:
         draw_points(panel, mine, CONTROL)
         draw_front(panel, mine, CONTROL.unit)
         panel.set(xscale="log", yscale="log", xlabel="wall time of a control step, p50 to p99 [ms]", title=case)
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panel.yaxis.set_major_formatter("{x:g}")
+        panel.yaxis.set_minor_formatter(NullFormatter())
     axes[0].set_ylabel("RMS tracking error after 1 s [mm]")
     draw_legend(axes[-1], rows, CONTROL, "number: horizon [periods of 10 ms]")
     figure.savefig(path)
