@@ -58,7 +58,7 @@ def draw_motion(rows: list[Row], path: Path) -> None:
         panel.set(xscale="log", yscale="log", xlabel="wall time per simulated second [s]", title=title)
         panel.set_ylim(top=3e2)  # room for what failed
         panel.axvline(1.0, color=GREY, lw=0.8, alpha=0.5)
-        panel.annotate("real time", (1.0, 0.01), xycoords=("data", "axes fraction"), fontsize=7.5, color=GREY,
+        panel.annotate("real time", (1.0, 0.3), xycoords=("data", "axes fraction"), fontsize=7.5, color=GREY,
                        rotation=90, ha="right", va="bottom")  # fmt: skip
         panel.minorticks_off()
     axes[0].set_ylabel("largest error of the tip within 1 s [mm]")
