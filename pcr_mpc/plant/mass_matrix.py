@@ -62,7 +62,14 @@ class CondensedMass:
 
 @lru_cache(maxsize=16)
 def robot_mass(robot: Robot, method: RodMethod) -> Any:
-    """Graph (unknowns (u, n), q (n)) -> M in [kg, kg m, kg m^2], d vec(M) / d(p, q)."""
+    """Graph of the mass matrix.
+
+    Returns
+    -------
+    casadi.Function
+        (unknowns (u, n), q (n)) -> M (2 + n, 2 + n) in [kg, kg m, kg m^2] for w = [v, q'], and d vec(M) / d(p, q),
+        shape ((2 + n)^2, 2 + n).
+    """
     n, of_rod = robot.n_rods, method.mass()
     unknowns, q = ca.MX.sym("unknowns", of_rod.size1_in(0), n), ca.MX.sym("q", n)
     mass, slopes = ca.MX(2 + n, 2 + n), ca.MX((2 + n) ** 2, 2 + n)
