@@ -31,8 +31,8 @@ def call_overhead(robot: Robot, pose: Equilibrium) -> list[dict[str, Any]]:
     list of {name, code, us}
         ``code``: "interpreted" by CasADi's virtual machine, or "compiled" C of the same graph, where there is a
         compiler. ``name``: "graph", the arithmetic alone, through a buffer; "plain call" of the graph as CasADi's
-        manual has it; "Plant.step"; "rollout", a step of a thousand in one call. ``us`` is of the
-        fastest of many batches: others on the machine can only add to it.
+        manual has it; "Plant.step"; "rollout", a step of a thousand in one call. ``us`` is CPU
+        time of the fastest of many batches, which others on the machine hardly change.
     """
     rows = []
     for compiled in (False, True) if shutil.which("cc") else (False,):
@@ -59,9 +59,9 @@ def call_overhead(robot: Robot, pose: Equilibrium) -> list[dict[str, Any]]:
         inputs = np.zeros((_ROLLED, robot.n_rods))
         spent = []
         for _ in range(_ROLLOUTS):
-            began = time.perf_counter()
+            began = time.thread_time()
             rollout(plant, x, inputs, guess=pose)
-            spent.append(time.perf_counter() - began)
+            spent.append(time.thread_time() - began)
         rows.append({"name": "rollout", "code": code, "us": 1e6 * min(spent) / _ROLLED})
     return rows
 
@@ -71,11 +71,11 @@ def _step(plant: Plant, state: list[np.ndarray], u: np.ndarray) -> None:
 
 
 def _fastest(call: Callable[[], Any]) -> float:
-    """Time of a call [us], by batches, so that the clock does not count."""
+    """CPU time of a call [us], by batches, so that the clock does not count."""
     best = math.inf
     for _ in range(_BATCHES):
-        began = time.perf_counter()
+        began = time.thread_time()
         for _ in range(_CALLS):
             call()
-        best = min(best, time.perf_counter() - began)
+        best = min(best, time.thread_time() - began)
     return 1e6 * best / _CALLS

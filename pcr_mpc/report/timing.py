@@ -64,7 +64,7 @@ def timing_tables(result: dict[str, Any]) -> str:
     codes = list(dict.fromkeys(row["code"] for row in result["overhead"]))
     found = {(row["name"], row["code"]): row["us"] for row in result["overhead"]}
     rows = [(name, *(f"{found[name, code]:.2f}" for code in codes)) for name in names]
-    parts.append(table(("a step of the plant, fastest [us]", *codes), rows))
+    parts.append(table(("a step of the plant, CPU time [us]", *codes), rows))
     errors = [f"{c['method']} {c['force_error']:.1e}" for c in components if "force_error" in c]
     parts.append(f"relative error of F along the run: {', '.join(errors)}")
     parts.append(", ".join(f"{name} {value}" for name, value in {**result["machine"], **result["versions"]}.items()))
@@ -170,7 +170,7 @@ def _overhead(axis: Any, rows: list[dict[str, Any]]) -> None:
             axis.barh(0, 0, color=colour, label=code)
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
-    axis.set(xscale="log", xlabel="velocity Verlet step, closed form [us]")
+    axis.set(xscale="log", xlabel="CPU time of a velocity Verlet step [us]")
     axis.set_xlim(1.0, 3 * max(row["us"] for row in rows))
     axis.set_title("Arithmetic, and what calling it costs")
     axis.legend(fontsize=8, loc="lower right")
