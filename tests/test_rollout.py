@@ -28,6 +28,7 @@ KINDS = [
         for inertia in ("none", "constant", "condensed")
     ),
     {"integrator": "velocity_verlet", "method": "multiple_shooting"},
+    {"integrator": "velocity_verlet", "method": "multiple_shooting", "inertia": "condensed"},
 ]
 
 

@@ -77,12 +77,18 @@ def _peers() -> list[str]:
 
 
 def _variants(file: str, filed: Tuning, plan: Plan) -> list[Tuning]:
-    if filed.law == "nonlinear_mpc":
-        return [filed, *(replace(filed, horizon=horizon) for horizon in plan.nonlinear)]
-    if file not in SWEPT:
+    """The tuning as filed and with other horizons and modes, by mode and horizon."""
+    horizons = {filed.horizon, *(plan.nonlinear if filed.law == "nonlinear_mpc" else plan.horizons)}
+    if filed.law != "nonlinear_mpc" and file not in SWEPT:
         return [filed]
-    modes = [replace(filed.model, linearise=mode) for mode in ("here", "along_plan")]
-    return [filed, *(replace(filed, horizon=horizon, model=model) for model in modes for horizon in plan.horizons)]
+    modes = ("here", "along_plan") if file in SWEPT else (filed.model.linearise,)
+    models = [replace(filed.model, linearise=mode) for mode in modes]
+    return [replace(filed, horizon=horizon, model=model) for model in models for horizon in sorted(horizons)]
+
+
+def filed_settings(file: str) -> str:
+    """Settings of a controller as it is filed."""
+    return _settings(load_tuning(ROOT / "controllers" / f"{file}.toml"))
 
 
 def _settings(tuning: Tuning) -> str:

@@ -66,7 +66,7 @@ def draw_points(panel: Any, rows: list[Row], look: Look, floor: float = 0.0) -> 
         if look.tag(row):
             panel.annotate(look.tag(row), (x, y), (3, 4), **style)
     for (family, _), at in lines.items():
-        panel.plot(*zip(*sorted(at), strict=True), "-", color=look.styles[family][0], lw=0.8, alpha=0.6)
+        panel.plot(*zip(*at, strict=True), "-", color=look.styles[family][0], lw=0.8, alpha=0.6)
     if lost:
         text = "\n".join(f"{name} ({count})" for name, count in lost.items())
         panel.annotate(f"failed throughout (settings):\n{text}", (0.98, 0.98), xycoords="axes fraction", ha="right",

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.charts.control import CROCODDYL, DO_MPC, SCENES
 from experiments.charts.draw import Look, Style, draw_front, draw_legend, draw_points
@@ -57,7 +58,7 @@ def draw_motion(rows: list[Row], path: Path) -> None:
         panel.set(xscale="log", yscale="log", xlabel="wall time per simulated second [s]", title=title)
         panel.set_ylim(top=3e2)  # room for what failed
         panel.axvline(1.0, color=GREY, lw=0.8, alpha=0.5)
-        panel.annotate("real time", (1.0, 0.01), xycoords=("data", "axes fraction"), fontsize=7.5, color=GREY,
+        panel.annotate("real time", (1.0, 0.3), xycoords=("data", "axes fraction"), fontsize=7.5, color=GREY,
                        rotation=90, ha="right", va="bottom")  # fmt: skip
         panel.minorticks_off()
     axes[0].set_ylabel("largest error of the tip within 1 s [mm]")
@@ -74,6 +75,9 @@ def draw_control(rows: list[Row], path: Path) -> None:
         draw_points(panel, mine, CONTROL)
         draw_front(panel, mine, CONTROL.unit)
         panel.set(xscale="log", yscale="log", xlabel="wall time of a control step, p50 to p99 [ms]", title=case)
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panel.yaxis.set_major_formatter("{x:g}")
+        panel.yaxis.set_minor_formatter(NullFormatter())
     axes[0].set_ylabel("RMS tracking error after 1 s [mm]")
     draw_legend(axes[-1], rows, CONTROL, "number: horizon [periods of 10 ms]")
     figure.savefig(path)

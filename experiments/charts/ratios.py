@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.charts.control import CROCODDYL, DO_MPC
+from experiments.charts.control import CROCODDYL, DO_MPC, filed_settings
 from experiments.charts.motion import ELASTICA, MUJOCO, YARDSTICK
 from experiments.charts.points import Row, failures
 from experiments.charts.statics import LITERAL, LITERAL_AT_ONCE
@@ -45,7 +45,7 @@ def ratios(rows: list[Row]) -> list[dict[str, Any]]:
                     and theirs and row["time_p50"] * need <= theirs["time_p50"]]  # fmt: skip
             found.append(_compared(release, _best(fast), theirs, wanted=WANTED.get(name)))
     for scene, file in _FILED.items():
-        ours = _pick(rows, scene, file)
+        ours = _pick(rows, scene, file, filed_settings(file))
         horizon = ours["settings"].split(",")[0] if ours else ""
         found.append(_compared(scene, ours, _pick(rows, scene, DO_MPC, horizon), wanted=WANTED[DO_MPC]))
         for name in (CROCODDYL, "nonlinear"):

@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.basins import CLASSES as BASINS
 from experiments.basins import find_poses
-from pcr_mpc import Equilibrium, PCRError, Robot, distance_to_fold, solve_statics
+from pcr_mpc import Equilibrium, PCRError, Robot, UnreachableError, distance_to_fold, solve_statics
 from pcr_mpc.plant import elastica
 from tests import taylor_rod
 
@@ -107,7 +107,11 @@ def _folding(robot: Robot, count: int) -> list[Equilibrium]:
 
 
 def _neighbour(target: Equilibrium, rng: np.random.Generator) -> Equilibrium:
-    tip, motors = rng.normal(size=2), rng.normal(size=target.robot.n_rods)
-    p = target.p + TIP_STEP * tip / np.linalg.norm(tip)
-    q = target.q + MOTOR_STEP * motors / np.linalg.norm(motors)
-    return solve_statics(target.robot, p, q, guess=target)
+    while True:
+        tip, motors = rng.normal(size=2), rng.normal(size=target.robot.n_rods)
+        p = target.p + TIP_STEP * tip / np.linalg.norm(tip)
+        q = target.q + MOTOR_STEP * motors / np.linalg.norm(motors)
+        try:
+            return solve_statics(target.robot, p, q, guess=target)
+        except UnreachableError:
+            continue  # on the far side of a taut rod

@@ -140,13 +140,13 @@ class Plant:
         self._mass = tip_mass(robot)
         self._mass_at: list[float] | None = None
         self._condensed: CondensedMass | None = None
-        if inertia != "none":
-            assert isinstance(self._solver, RodSolver)
-            self._condensed = CondensedMass(robot, self._solver.method)
         self.step_model: StepModel | None = None
-        if isinstance(self._solver, RodSolver) and inertia != "full":
+        if isinstance(self._solver, RodSolver):
             of_rods = self._solver.method
-            self.step_model = StepModel(robot, rods, of_rods, integrator, inertia, weight == "condensed", dt)
+            if inertia != "none":
+                self._condensed = CondensedMass(robot, of_rods)
+            if inertia != "full":
+                self.step_model = StepModel(robot, rods, of_rods, integrator, inertia, weight == "condensed", dt)
         self._quick: QuickStep | None = None
         self._quick_at: list[float] | None = None
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from ..buffered import BufferedFunction
 from ..errors import PCRError, checked_array
 from ..frozen import freeze
 from .dynamics import Plant
@@ -16,8 +18,8 @@ from .step_graph import CORRECTIONS, StepModel, limits, step_function
 
 # Steps in one call: more of them make nothing faster.
 _STEPS = 1000
-# Robots times steps in one call; a few hundred bytes each.
-_MOST_STEPS = 100_000
+# Robots times steps in one call: a few hundred bytes each, which stay.
+_MOST_STEPS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +101,8 @@ def rollout(
         for first in range(0, len(left), at_once):
             some = left[first : first + at_once]
             given = np.concatenate([inputs[some], f_ext[some]], axis=2)
-            settings = {"corrections": corrections, "compiled": plant.compiled}
-            x[some], residual[some], done[some] = _moved(model, settings, memories[some], starts[some], given, threads)
+            settings = corrections, plant.compiled, threads
+            x[some], residual[some], done[some] = _moved(model, settings, memories[some], starts[some], given)
     stepped = np.flatnonzero(~done).tolist()
     for i in stepped:
         x[i], residual[i] = _stepped(plant, i, starts[i], inputs[i], f_ext[i], guess)
@@ -140,35 +142,40 @@ def _memories(plant: Plant, starts: np.ndarray, guess: Equilibrium | None) -> np
 
 def _moved(
     model: StepModel,
-    settings: dict[str, Any],
+    settings: tuple[int, bool, int],
     memories: np.ndarray,
     starts: np.ndarray,
     given: np.ndarray,
-    threads: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States, residuals, and which robots kept to their branch all the way."""
     robots, steps = given.shape[:2]
-    parts, verdicts = [starts[:, None]], []
+    x, verdicts = np.empty((robots, steps + 1, starts.shape[1])), np.empty((robots, steps, 5))
+    x[:, 0] = starts
     for first in range(0, steps, _STEPS):
-        block = given[:, first : first + _STEPS]
-        length = block.shape[1]
-        graph = _many_steps(model, length, **settings)
-        if robots > 1:
-            graph = graph.map(robots, "thread", threads) if threads > 1 else graph.map(robots, "serial")
-        results = graph(memories.T, parts[-1][:, -1].T, block.reshape(robots * length, -1).T)
-        memory, x, verdict = (result.full().T.reshape(robots, length, -1) for result in results)
-        memories = memory[:, -1]
-        parts.append(x)
-        verdicts.append(verdict)
-    verdict = np.concatenate(verdicts, axis=1)
-    good = np.all(verdict <= limits(model), axis=(1, 2))
-    return np.concatenate(parts, axis=1), verdict[:, :, 0], np.asarray(good)
+        block = slice(first, min(steps, first + _STEPS))
+        length = block.stop - first
+        graph = _many_steps(model, length, robots, *settings, threading.get_ident())
+        # CasADi puts robots and steps side by side, column by column: rows of these views.
+        memory, start, told = (place.T.reshape(robots, -1) for place in graph.inputs)
+        results = [place.T.reshape(robots, length, -1) for place in graph.outputs]
+        memory[:], start[:], told[:] = memories, x[:, first], given[:, block].reshape(robots, -1)
+        graph()
+        memories = results[0][:, -1].copy()
+        x[:, first + 1 : block.stop + 1], verdicts[:, block] = results[1:]
+    good = np.all(verdicts <= limits(model), axis=(1, 2)) & np.isfinite(x).all(axis=(1, 2))
+    return x, verdicts[:, :, 0], np.asarray(good)
 
 
-@lru_cache(maxsize=16)
-def _many_steps(model: StepModel, steps: int, *, corrections: int, compiled: bool) -> Any:
+@lru_cache(maxsize=8)
+def _many_steps(
+    model: StepModel, steps: int, robots: int, corrections: int, compiled: bool, threads: int, caller: int
+) -> BufferedFunction:
+    """One graph for each thread of the caller's: its buffers are shared memory."""
     step = step_function(model, corrections, details=False, compiled=compiled)
-    return step.mapaccum("steps", steps, 2, {})
+    graph = step.mapaccum("steps", steps, 2, {})
+    if robots > 1:
+        graph = graph.map(robots, "thread", threads) if threads > 1 else graph.map(robots, "serial")
+    return BufferedFunction(graph)
 
 
 def _stepped(

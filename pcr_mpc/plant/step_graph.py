@@ -164,8 +164,10 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
         on top of the tip's weight. The verdict is that of `warm_step`, added up over the solves of the step.
     """
     robot, n, dt = model.robot, model.robot.n_rods, model.dt
-    warm = warm_step(model.rods, model.method, corrections)
-    symbol: Any = (ca.SX if warm.is_a("SXFunction") else ca.MX).sym
+    graphs = [warm_step(model.rods, model.method, corrections)]
+    if model.inertia == "condensed":
+        graphs.append(robot_mass(robot, model.method))
+    symbol: Any = (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym
     memory, x, given = symbol("memory", sum(model.widths)), symbol("x", 4 + n), symbol("given", n + 2)
     u, f_ext = given[:n], given[n:]
     # As Robot.motor_rates.
