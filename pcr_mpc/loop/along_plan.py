@@ -50,10 +50,16 @@ class AlongPlan:
             spot.plant.reset(x, pose)
             spot.at = spot.model = None
 
-    def models(self, path: np.ndarray, u: np.ndarray, force: np.ndarray) -> list[LinearModel]:
-        """Models about the states of ``path``, shape (N - 1, 4 + n), under an external force; errors as `linearise`."""
+    def models(self, path: np.ndarray, u: np.ndarray, force: np.ndarray, payloads: np.ndarray) -> list[LinearModel]:
+        """Models about the states of ``path``, shape (N - 1, 4 + n), under an external force; errors as `linearise`.
+
+        ``payloads`` are what the tip carries there, shape (N - 1,) [kg].
+        """
         found = []
-        for spot, x in zip(self._spots, path, strict=True):
+        for spot, x, payload in zip(self._spots, path, payloads.tolist(), strict=True):
+            if payload != spot.plant.payload:
+                spot.plant.carry(payload, x)
+                spot.at = None
             at = np.concatenate([x[:2], x[4:]])
             if spot.model is None or spot.at is None or (np.abs(at - spot.at) > self._moved).any():
                 spot.at, spot.model = at, linearise(spot.plant, x, u, self._period, force)

@@ -15,8 +15,8 @@ from .scene import Scene
 def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int) -> Reference:
     """Inverse dynamics of the reference at every period, and one horizon beyond the end.
 
-    The motor angles are those at which the rods carry F = -m a - c v on the reference; the rates lead from
-    each to the next.
+    The motor angles are those at which the rods carry F = -m a - c v on the reference, m with what the scene says that
+    the tip carries, whose weight is a part of F too; the rates lead from each to the next.
 
     Returns
     -------
@@ -32,10 +32,11 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int) ->
     t = scene.period * np.arange(scene.n_periods + horizon + 1)
     samples = scene.trajectory(t)
     states, forces = np.empty((len(t), 4 + robot.n_rods)), np.empty((len(t), 2))
+    loads = scene.carried(t)[:, None] * (robot.gravity - samples[:, 2])
     eq = pose
     for k in range(len(t)):
         p, v, a = samples[k]
-        forces[k] = -robot.tip_mass * a - robot.drag * v
+        forces[k] = -robot.tip_mass * a - robot.drag * v + loads[k]
         try:
             eq = inverse_statics(robot, p, forces[k], guess=eq)
         except PCRError as error:

@@ -25,6 +25,7 @@ from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 LATE = ("hold", "shifted_plan")
 # Distance of the start from the reference that is taken for the same place [m].
 _START_TOLERANCE = 1e-3
+_SAME_TIME = 1e-9  # s
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
 
@@ -42,6 +43,28 @@ class PlantSettings:
     on_snap: str
     inertia: str = "none"
     weight: str | None = None
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What the tip picks up, at rest, and puts down again.
+
+    Attributes
+    ----------
+    mass : float
+        [kg].
+    pick, place : float
+        When [s].
+    """
+
+    mass: float
+    pick: float
+    place: float
+
+    def carried(self, t: np.ndarray) -> np.ndarray:
+        """Mass that the tip carries from the times t on [kg], same shape."""
+        # Times are sums of steps: rounding must not decide.
+        return np.where((t > self.pick - _SAME_TIME) & (t < self.place - _SAME_TIME), self.mass, 0.0)
 
 
 @dataclass(frozen=True)
@@ -84,6 +107,7 @@ class Scene:
         What the motors do until a late decision arrives: go on as before, or as the last plan foresaw.
     pose_limits : PoseLimits
         Torque, tip region and stability margins, which a controller keeps if it can.
+    payload : Payload or None
     """
 
     name: str
@@ -104,6 +128,11 @@ class Scene:
     deadline: float = math.inf
     late: str = LATE[0]
     pose_limits: PoseLimits = field(default_factory=PoseLimits)
+    payload: Payload | None = None
+
+    def carried(self, t: np.ndarray) -> np.ndarray:
+        """Payload at the times t [s], same shape [kg]."""
+        return np.zeros(np.shape(t)) if self.payload is None else self.payload.carried(t)
 
     @property
     def n_periods(self) -> int:
@@ -226,11 +255,16 @@ def load_scene(path: str | Path) -> Scene:
             force = load.vector("force", 2, (0.0, 0.0))
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
+        payload = None
+        if file.has("payload"):
+            with file.table("payload") as table:
+                pick = table.number("pick", minimum=0.0)
+                payload = Payload(table.number("mass", above=0.0), pick, table.number("place", above=pick))
         with file.table("reference") as reference:
             trajectory = _trajectory(reference)
     scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                   tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
-                  delay, deadline, late, pose_limits)  # fmt: skip
+                  delay, deadline, late, pose_limits, payload)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

@@ -76,6 +76,8 @@ def simulate(
     states[0] = x
     done, decided, snapped = 0, 0, 0
     meanwhile = np.zeros(n)
+    payloads = scene.carried(plant.dt * np.arange(n_periods * per))
+    changes = set(np.flatnonzero(np.diff(payloads, prepend=0.0)).tolist())
 
     def record() -> Run:
         t = plant.dt * np.arange(done + 1)
@@ -139,6 +141,8 @@ def simulate(
                     )
             for j in range(per):
                 u = meanwhile if j < waiting else arrived
+                if done in changes:
+                    x = plant.carry(float(payloads[done]), x)
                 began = time.perf_counter()
                 x = plant.step(x, u, scene.force)
                 plant_time[done] = time.perf_counter() - began

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..buffered import BufferedFunction
-from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
+from ..errors import ConvergenceError, PCRError, UnstableError, checked_number, checked_vector
 from ..frozen import read_only
 from .equilibrium import Equilibrium
 from .inertia import INERTIAS, robot_mass
@@ -69,7 +69,8 @@ class Plant:
     -----
     A state does not say on which branch the rods are, so the plant follows them by continuity from one call
     to the next; `reset` starts elsewhere. Motors saturate: rates are clipped to the limit and angles stop at
-    theirs. (The limit on the change of rate concerns commands, and is the controller's.)
+    theirs. (The limit on the change of rate concerns commands, and is the controller's.) What the tip carries besides
+    its own mass is the plant's ``payload`` [kg], see `carry`.
 
     A motor's rate jumps from one step to the next, and a rod's mass makes that an impulse on the tip: the momentum
     M_pp p' + M_pq u has no jump, p' has one. The state's v is therefore M_pp^-1 times the momentum: the velocity
@@ -138,6 +139,7 @@ class Plant:
         n = robot.n_rods
         tip_alone = np.diag([robot.tip_mass] * 2 + [0.0] * n)
         self._mass = read_only(tip_alone), read_only(np.zeros(((2 + n) ** 2, 2 + n)))
+        self.payload = 0.0
         self._mass_at: tuple[float, ...] | None = None
         self._condensed = None if inertia == "none" else BufferedFunction(robot_mass(robot))
 
@@ -147,6 +149,7 @@ class Plant:
         p, q = x[:2], x[4:]
         self.robot.require_reachable(p)
         self._at = None
+        self._take(0.0)
         if guess is None:
             self._solver.start(p, q)
         else:
@@ -157,10 +160,49 @@ class Plant:
         if self.inertia == "constant":
             self._mass = self._condensed_mass(q)[0], self._mass[1]
 
+    def carry(self, payload: float, x: Any) -> np.ndarray:
+        """Let the tip carry a payload besides its own mass from state x on; a `reset` takes it away.
+
+        What is picked up was at rest: the momentum stays, and the tip becomes slower. What is put down leaves with the
+        velocity of the tip, which stays.
+
+        Parameters
+        ----------
+        payload : float
+            All that is carried from now on [kg]; it has weight where there is gravity.
+        x : array_like, shape (4 + n,)
+            State [m, m/s, rad].
+
+        Returns
+        -------
+        ndarray, shape (4 + n,)
+            State just after.
+        """
+        payload = checked_number("payload", payload, minimum=0.0)
+        x = np.array(checked_vector("x", x, self.n_states))
+        picked_up, momentum = payload - self.payload, self.mass(x[:2], x[4:])[0][:2, :2] @ x[2:4]
+        self._take(payload)
+        if picked_up <= 0.0:
+            return x
+        if self._modal is not None and (after := self._modal.pick_up(self, picked_up, x)) is not None:
+            return after
+        x[2:4] = np.linalg.solve(self.mass(x[:2], x[4:])[0][:2, :2], momentum)
+        return x
+
+    def _take(self, payload: float) -> None:
+        if payload == self.payload:
+            return
+        mass, slopes = self._mass
+        n = self.robot.n_rods
+        self._mass = read_only(mass + np.diag([payload - self.payload] * 2 + [0.0] * n)), slopes
+        self.payload, self._mass_at = payload, None
+        if self._modal is not None:
+            self._modal.rods.tip_mass = self.robot.tip_mass + payload
+
     @property
     def tip_weight(self) -> np.ndarray:
-        """m g, shape (2,) [N]."""
-        return self.robot.tip_weight
+        """Of tip mass and payload, shape (2,) [N]."""
+        return np.asarray(self.robot.tip_weight + self.payload * np.array(self.robot.gravity))
 
     @property
     def snaps(self) -> list[Snap]:
@@ -321,7 +363,9 @@ class Plant:
         graph.inputs[0][:] = self._solver.state.unknowns
         graph.inputs[1][:] = q
         graph()
-        mass, slopes = (read_only(output.copy()) for output in graph.outputs)
+        mass, slopes = (output.copy() for output in graph.outputs)
+        mass[0, 0] += self.payload
+        mass[1, 1] += self.payload
         if not math.isfinite(slopes.sum()):
             raise ConvergenceError(
                 f"the inertia of the rods at q = {q} rad has no finite derivative: a rod is straight and pushed; "
@@ -330,7 +374,7 @@ class Plant:
                 iterations=0,
                 last=graph.inputs[0].copy(),
             )
-        return mass, slopes
+        return read_only(mass), read_only(slopes)
 
 
 __all__ = ["INTEGRATORS", "ON_SNAP", "Plant"]
