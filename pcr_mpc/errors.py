@@ -65,6 +65,10 @@ class SimulationError(PCRError):
     """A closed-loop run ended early; ``run`` holds everything until then."""
 
 
+class NoRungError(PCRError):
+    """No rung of the ladder of physics meets a scene's ``need``: ``best_error`` [m], and why each was ``rejected``."""
+
+
 class StudyError(PCRError):
     """A study of many runs cannot go on, or ended without some of its results; names the file of those that it has."""
 

@@ -7,7 +7,7 @@ import pytest
 
 from pcr_mpc import ModelError, Plant, inverse_statics, linearise, load_scene, make_controller, simulate
 from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.scene import Payload
+from pcr_mpc.loop.settings import Payload
 
 from .conftest import MODELS
 

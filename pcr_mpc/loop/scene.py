@@ -11,60 +11,19 @@ import numpy as np
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError
 from ..linearisation.pose_limits import PoseLimits
-from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
+from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import forward_statics, inverse_statics
-from ..plant.inertia import INERTIAS
 from ..plant.robot import Robot, load_robot
-from ..plant.rod import SCHEMES
-from ..plant.statics import METHODS, default_method
-from ..plant.weight import WEIGHTS
 from ..toml_table import Table, read_toml
+from .settings import Need, Payload, PlantSettings, read_need, read_payload, read_plant
 from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 
 LATE = ("hold", "shifted_plan")
 # Distance of the start from the reference that is taken for the same place [m].
 _START_TOLERANCE = 1e-3
-_SAME_TIME = 1e-9  # s
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
-
-
-@dataclass(frozen=True)
-class PlantSettings:
-    """How the plant is simulated: the arguments of `Plant`."""
-
-    method: str
-    segments: int
-    steps: int
-    scheme: str
-    integrator: str
-    dt: float
-    on_snap: str
-    inertia: str = "none"
-    weight: str | None = None
-
-
-@dataclass(frozen=True)
-class Payload:
-    """What the tip picks up, at rest, and puts down again.
-
-    Attributes
-    ----------
-    mass : float
-        [kg].
-    pick, place : float
-        When [s].
-    """
-
-    mass: float
-    pick: float
-    place: float
-
-    def carried(self, t: np.ndarray) -> np.ndarray:
-        """Mass that the tip carries from the times t on [kg], same shape."""
-        # Times are sums of steps: rounding must not decide.
-        return np.where((t > self.pick - _SAME_TIME) & (t < self.place - _SAME_TIME), self.mass, 0.0)
 
 
 @dataclass(frozen=True)
@@ -108,6 +67,8 @@ class Scene:
     pose_limits : PoseLimits
         Torque, tip region and stability margins, which a controller keeps if it can.
     payload : Payload or None
+    need : Need or None
+        What is asked of the simulation.
     """
 
     name: str
@@ -129,6 +90,7 @@ class Scene:
     late: str = LATE[0]
     pose_limits: PoseLimits = field(default_factory=PoseLimits)
     payload: Payload | None = None
+    need: Need | None = None
 
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Payload at the times t [s], same shape [kg]."""
@@ -180,19 +142,7 @@ class Scene:
 
     def make_plant(self) -> Plant:
         """Build the plant of this scene."""
-        settings = self.plant
-        return Plant(
-            self.robot,
-            method=settings.method,
-            segments=settings.segments,
-            steps=settings.steps,
-            scheme=settings.scheme,
-            integrator=settings.integrator,
-            dt=settings.dt,
-            on_snap=settings.on_snap,
-            inertia=settings.inertia,
-            weight=settings.weight,
-        )
+        return self.plant.make(self.robot)
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -225,21 +175,7 @@ def load_scene(path: str | Path) -> Scene:
             if (tip is None) == (motors is None) or (tip is None) != (mode is None):
                 raise start.fail("tip", "give either tip and mode, or motors")
         with file.table("plant") as table:
-            plant = PlantSettings(
-                method=table.text("method", default_method(robot), choices=METHODS),
-                segments=table.integer("segments", 8),
-                steps=table.integer("steps", 1),
-                scheme=table.text("scheme", "rk8", choices=tuple(SCHEMES)),
-                integrator=table.text("integrator", choices=(*INTEGRATORS, "gauss")),
-                dt=table.number("dt", above=0.0),
-                on_snap=table.text("on_snap", "raise", choices=ON_SNAP),
-                inertia=table.text("inertia", "none", choices=INERTIAS),
-                weight=table.text("weight", None, choices=WEIGHTS),
-            )
-            if (plant.inertia == "full") != (plant.integrator == "gauss"):
-                raise table.fail("integrator", f"is {plant.integrator}: inertia 'full' needs 'gauss', and only it does")
-            if plant.inertia != "none" and plant.method != "closed_form":
-                raise table.fail("inertia", f"is {plant.inertia}, which needs method 'closed_form', not {plant.method}")
+            plant = read_plant(table, robot)
         with file.table("control") as control:
             period = control.number("period", above=0.0)
             tuning = control.text("tuning", None)
@@ -255,16 +191,13 @@ def load_scene(path: str | Path) -> Scene:
             force = load.vector("force", 2, (0.0, 0.0))
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
-        payload = None
-        if file.has("payload"):
-            with file.table("payload") as table:
-                pick = table.number("pick", minimum=0.0)
-                payload = Payload(table.number("mass", above=0.0), pick, table.number("place", above=pick))
+        payload = read_payload(file)
+        need = read_need(file)
         with file.table("reference") as reference:
             trajectory = _trajectory(reference)
     scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                   tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
-                  delay, deadline, late, pose_limits, payload)  # fmt: skip
+                  delay, deadline, late, pose_limits, payload, need)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

@@ -76,7 +76,8 @@ def simulate(
     states[0] = x
     done, decided, snapped = 0, 0, 0
     meanwhile = np.zeros(n)
-    payloads = scene.carried(plant.dt * np.arange(n_periods * per))
+    carries = scene.plant.payload == "carried"
+    payloads = carries * scene.carried(plant.dt * np.arange(n_periods * per))
     changes = set(np.flatnonzero(np.diff(payloads, prepend=0.0)).tolist())
 
     def record() -> Run:

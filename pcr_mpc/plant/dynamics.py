@@ -179,15 +179,16 @@ class Plant:
             State just after.
         """
         payload = checked_number("payload", payload, minimum=0.0)
-        x = np.array(checked_vector("x", x, self.n_states))
-        picked_up, momentum = payload - self.payload, self.mass(x[:2], x[4:])[0][:2, :2] @ x[2:4]
+        after = checked_vector("x", x, self.n_states).copy()
+        p, v, q = after[:2], after[2:4], after[4:]
+        picked_up, momentum = payload - self.payload, self.mass(p, q)[0][:2, :2] @ v
         self._take(payload)
         if picked_up <= 0.0:
-            return x
-        if self._modal is not None and (after := self._modal.pick_up(self, picked_up, x)) is not None:
             return after
-        x[2:4] = np.linalg.solve(self.mass(x[:2], x[4:])[0][:2, :2], momentum)
-        return x
+        if self._modal is not None and (vibrating := self._modal.pick_up(self, picked_up, after)) is not None:
+            return vibrating
+        v[:] = np.linalg.solve(self.mass(p, q)[0][:2, :2], momentum)
+        return after
 
     def _take(self, payload: float) -> None:
         if payload == self.payload:
