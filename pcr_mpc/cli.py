@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import math
 import re
@@ -34,6 +33,7 @@ from .plant.mujoco_plant import MuJoCoPlant
 from .plant.robot import load_robot
 from .plant.stability import all_equilibria, assess_stability
 from .plant.statics import METHODS, solve_statics
+from .report.csv_rows import write_rows
 from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
 from .report.tables import (
     equilibria_table,
@@ -287,10 +287,7 @@ def _tune(options: argparse.Namespace) -> int:
         chosen = tune(search, options.trials, executor)
     trials = finished_trials(search)
     files = {name: str(folder / name) for name in ("trials.csv", "trade_off.png")}
-    with open(files["trials.csv"], "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=list(trials[0]))
-        writer.writeheader()
-        writer.writerows(trials)
+    write_rows(Path(files["trials.csv"]), trials)
     plot_trade_off(trials, chosen.trial if chosen else None, f"Tuning for {scene.name}", folder / "trade_off.png")
     if chosen is not None:
         path = options.out or default_path(options.scene, scene.name)

@@ -1,4 +1,4 @@
-"""The choice of the physics that a scene needs: every rung measured on the scene's own motion, the lowest that will do."""
+"""The choice of the physics that a scene needs: rungs measured on the scene's own motion, the lowest that will do."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from tqdm import tqdm
 from ..errors import NoRungError, PCRError, SimulationError
 from .controllers import Replay
 from .estimates import Estimate, Estimates
-from .rungs import all_physics, discretisations, height, levels
 from .run import Run
+from .rungs import all_physics, discretisations, height, levels
 from .scene import Scene
 from .settings import Need, PlantSettings
 from .simulate import simulate
@@ -138,8 +138,8 @@ class Bench:
         try:
             run = self._simulate(rung, self._run.u)
         except SimulationError as error:
-            return Measured(rung, math.inf, float(np.median(error.run.plant_time)) if len(error.run.t) > 1 else math.nan,
-                            str(error))  # fmt: skip
+            times = error.run.plant_time
+            return Measured(rung, math.inf, float(np.median(times)) if len(times) else math.nan, str(error))
         return Measured(rung, self._distance(run), float(np.median(run.plant_time)))
 
     def _simulate(self, rung: PlantSettings, rates: np.ndarray | None) -> Run:
@@ -174,8 +174,10 @@ def choose(scene: Scene, *, progress: bool = False) -> Choice:
         No rung meets it.
     """
     if scene.need is None:
-        raise ValueError(f"scene {scene.name} states no need; give it a [need] table with tip_accuracy [mm], plant_step "
-                         "[us] and control_step [us]")  # fmt: skip
+        raise ValueError(
+            f"scene {scene.name} states no need; give it a [need] table with tip_accuracy [mm], plant_step and "
+            "control_step [us]"
+        )
     bench = Bench(scene)
     bar = tqdm(bench.rungs, desc="rungs", unit="rung", disable=not progress)
     physics = [bench.measure(rung) for rung in bar]
@@ -199,7 +201,7 @@ def lowest(
     unmeasured: float = 0.0,
     control_step: float | None = None,
 ) -> tuple[list[Measured], Measured]:
-    """Pick the lowest physics that is accurate enough in some discretisation that is quick enough, and the cheapest of those.
+    """Pick the lowest physics that is accurate and quick enough in some discretisation, and the cheapest of those.
 
     Parameters
     ----------
@@ -244,11 +246,10 @@ def lowest(
                 return tried, tried[-1]
         quickest = min((one.step_time for one in tried if one.error <= allowed), default=math.inf)
         rejected.append(f"{named(candidate.rung)} {1e6 * quickest:.0f} us a step")
+    share = f", {1e3 * unmeasured:.2g} mm of each by which the yardstick may be off" if unmeasured else ""
     raise NoRungError(
-        f"{scene.name} needs the tip to {1e3 * need.tip_accuracy:g} mm at {1e6 * need.plant_step:g} us a plant step, and no "
-        f"rung gives that: {'; '.join(rejected)}"
-        + (f". In each error are {1e3 * unmeasured:.2g} mm by which the yardstick itself may be off" if unmeasured else "")
-        + ". Allow more, or drive the robot more gently",
+        f"{scene.name} needs the tip to {1e3 * need.tip_accuracy:g} mm at {1e6 * need.plant_step:g} us a plant step, and "
+        f"no rung gives that: {'; '.join(rejected)}{share}. Allow more, or drive the robot more gently",
         need=need, best_error=best + unmeasured, rejected=rejected,
     )  # fmt: skip
 

@@ -14,8 +14,8 @@ from ..plant.weight import WEIGHTS
 from .scene import Scene
 from .settings import PAYLOADS, RODS, PlantSettings
 
-# Steps in a control period: some, for what happens within it, such as a late decision. Force evaluations a step, which is
-# what a step costs.
+# Steps in a control period: some, for what happens within it, such as a late decision. Force evaluations a step, which
+# is what a step costs.
 STEPS_PER_PERIOD = (5, 10, 20, 40)
 FORCES_PER_STEP = {"semi_implicit_euler": 1, "velocity_verlet": 1, "rk4": 4, "gauss": 1}
 # Segments, steps in each and scheme of multiple shooting: time of a force, relative. The last is as good as exact.
