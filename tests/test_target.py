@@ -68,6 +68,6 @@ def test_statics_are_solved_for_the_target_only_where_the_shift_is_large(lemnisc
 
 def test_inverse_dynamics_that_do_not_settle_are_refused(lemniscate, monkeypatch):
     monkeypatch.setattr("pcr_mpc.loop.feed_forward._MOST_SWEEPS", 1)
-    with pytest.raises(ConvergenceError, match="did not settle.*slower reference") as caught:
+    with pytest.raises(ConvergenceError, match=r"did not settle.*slower reference") as caught:
         feed_forward(lemniscate, lemniscate.robot, lemniscate.start(), 10, "condensed")
     assert 1e-5 < caught.value.residual < 1e-1

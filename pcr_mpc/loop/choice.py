@@ -13,7 +13,7 @@ from ..errors import NoRungError, PCRError, SimulationError
 from .controllers import Replay
 from .estimates import Estimate, Estimates
 from .run import Run
-from .rungs import all_physics, discretisations, height, levels
+from .rungs import all_physics, discretisations, height, named
 from .scene import Scene
 from .settings import Need, PlantSettings
 from .simulate import simulate
@@ -248,12 +248,7 @@ def lowest(
         rejected.append(f"{named(candidate.rung)} {1e6 * quickest:.0f} us a step")
     share = f", {1e3 * unmeasured:.2g} mm of each by which the yardstick may be off" if unmeasured else ""
     raise NoRungError(
-        f"{scene.name} needs the tip to {1e3 * need.tip_accuracy:g} mm at {1e6 * need.plant_step:g} us a plant step, and "
-        f"no rung gives that: {'; '.join(rejected)}{share}. Allow more, or drive the robot more gently",
+        f"{scene.name} needs the tip to {1e3 * need.tip_accuracy:g} mm at {1e6 * need.plant_step:g} us a plant step, "
+        f"and no rung gives that: {'; '.join(rejected)}{share}. Allow more, or drive the robot more gently",
         need=need, best_error=best + unmeasured, rejected=rejected,
     )  # fmt: skip
-
-
-def named(rung: PlantSettings) -> str:
-    """Physics of a rung in words."""
-    return ", ".join(f"{name} {level}" for name, level in levels(rung).items())

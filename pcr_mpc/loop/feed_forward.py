@@ -120,7 +120,7 @@ def _angles(
 def _momentum(
     plant: Plant, carried: np.ndarray, p: np.ndarray, v: np.ndarray, q: np.ndarray, rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Momentum pi of tip and rods [N s], dT/dp [N] and M_pp^-1 pi with what is carried [m/s] at K poses, (K, 2) each."""
+    """Momentum of tip and rods [N s], dT/dp [N], M_pp^-1 pi with what is carried [m/s] at K poses, (K, 2) each."""
     n = 2 + plant.robot.n_rods
     momentum, push, own = (np.empty_like(p) for _ in range(3))
     for k in range(len(p)):

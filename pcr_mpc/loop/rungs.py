@@ -40,6 +40,11 @@ def levels(rung: PlantSettings) -> dict[str, str]:
     return {name: str(getattr(rung, name)) for name in ("inertia", "weight", "rods", "payload")}
 
 
+def named(rung: PlantSettings) -> str:
+    """Physics of a rung in words."""
+    return ", ".join(f"{name} {level}" for name, level in levels(rung).items())
+
+
 def height(scene: Scene, rung: PlantSettings) -> int:
     """How many levels up a rung is, all ladders together."""
     own = levels(rung)

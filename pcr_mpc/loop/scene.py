@@ -16,7 +16,7 @@ from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import forward_statics, inverse_statics
 from ..plant.robot import Robot, load_robot
 from ..toml_table import Table, read_toml
-from .settings import Need, Payload, PlantSettings, read_need, read_payload, read_plant
+from .settings import Finding, Need, Payload, PlantSettings, read_finding, read_need, read_payload, read_plant
 from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 
 LATE = ("hold", "shifted_plan")
@@ -69,6 +69,8 @@ class Scene:
     payload : Payload or None
     need : Need or None
         What is asked of the simulation.
+    finding : Finding or None
+        What is known of the plant's rung.
     """
 
     name: str
@@ -91,6 +93,7 @@ class Scene:
     pose_limits: PoseLimits = field(default_factory=PoseLimits)
     payload: Payload | None = None
     need: Need | None = None
+    finding: Finding | None = None
 
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Payload at the times t [s], same shape [kg]."""
@@ -192,12 +195,12 @@ def load_scene(path: str | Path) -> Scene:
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
         payload = read_payload(file)
-        need = read_need(file)
+        need, finding = read_need(file), read_finding(file)
         with file.table("reference") as reference:
             trajectory = _trajectory(reference)
     scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                   tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
-                  delay, deadline, late, pose_limits, payload, need)  # fmt: skip
+                  delay, deadline, late, pose_limits, payload, need, finding)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

@@ -78,6 +78,25 @@ class Need:
 
 
 @dataclass(frozen=True)
+class Finding:
+    """What `pcr-mpc choose` found about the rung that stands in the scene's [plant] table.
+
+    Attributes
+    ----------
+    tip_error : float
+        [m], the yardstick's own uncertainty included.
+    estimated : float
+        The part of it that is estimated, not measured [m].
+    digest : str
+        Of all that it rests on (see `chosen_rung.digest`).
+    """
+
+    tip_error: float
+    estimated: float
+    digest: str
+
+
+@dataclass(frozen=True)
 class Payload:
     """What the tip picks up, at rest, and puts down again.
 
@@ -139,3 +158,12 @@ def read_need(file: Table) -> Need | None:
     with file.table("need") as table:
         numbers = [table.number(key, above=0.0) for key in ("tip_accuracy", "plant_step", "control_step")]
         return Need(1e-3 * numbers[0], 1e-6 * numbers[1], 1e-6 * numbers[2])
+
+
+def read_finding(file: Table) -> Finding | None:
+    """Take a scene's [chosen] table, if it has one."""
+    if not file.has("chosen"):
+        return None
+    with file.table("chosen") as table:
+        tip_error = 1e-3 * table.number("tip_error", minimum=0.0)
+        return Finding(tip_error, 1e-3 * table.number("estimated", minimum=0.0), table.text("digest"))
