@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..buffered import BufferedFunction
 from ..errors import ConvergenceError, PCRError, UnstableError, checked_number, checked_vector
 from ..frozen import read_only
 from .equilibrium import Equilibrium
-from .inertia import INERTIAS, robot_mass
+from .inertia import INERTIAS
 from .integrators import INTEGRATORS
+from .mass_matrix import CondensedMass, MassMatrix, tip_mass
 from .modal_step import ModalStep
 from .robot import Robot
 from .rod_solver import RodSolver, Snap
@@ -47,7 +46,7 @@ class Plant:
     inertia : {"none", "constant", "condensed", "full"}
         Of the rods: none, the paper's; the mass matrix M(p, q) that their quasi-static shapes carry (see `inertia`)
         as it was at the last `reset`; M(p, q) with its Coriolis terms; or distributed mass in strain modes, the
-        yardstick (see `strain_modes`). With mass the statics must be the closed form.
+        yardstick (see `strain_modes`). Single shooting knows none but the first.
     modes : int
         Strain modes per rod, of inertia "full": 12 are within 1e-6 mm of 14 on the default robot.
     weight : {"none", "condensed", "exact"}, optional
@@ -114,12 +113,12 @@ class Plant:
         method = method or default_method(rods)
         if weight == "condensed" and method != "closed_form":
             raise ValueError(f"weight='condensed' needs method='closed_form', not {method!r}; take weight='exact'")
-        if weight != "none" and inertia == "full":
-            raise ValueError(f"inertia='full' has weightless rods, not weight={weight!r}; take weight='none'")
+        if weight == "condensed" and inertia == "full":
+            raise ValueError("inertia='full' does not condense the rods' weight; take weight='exact' or 'none'")
+        if inertia != "none" and method == "single_shooting":
+            raise ValueError(f"inertia={inertia!r} needs method='closed_form' or 'multiple_shooting', not {method!r}")
         if not 0.0 < dt < np.inf:
             raise ValueError(f"dt is {dt} s, expected a positive number")
-        if inertia != "none" and method != "closed_form":
-            raise ValueError(f"inertia is {inertia!r}, which needs method='closed_form', not {method!r}")
         if isinstance(modes, bool) or not isinstance(modes, int | np.integer) or not 4 <= modes <= _MOST_MODES:
             raise ValueError(f"modes = {modes!r} must be a whole number from 4 to {_MOST_MODES}")
         self.robot = robot
@@ -129,19 +128,20 @@ class Plant:
         self.integrator = integrator
         self.dt = dt
         self.n_states = 4 + robot.n_rods
-        self._modal = ModalStep(robot, int(modes)) if inertia == "full" else None
+        self._modal = ModalStep(rods, int(modes)) if inertia == "full" else None
         self._advance = self._modal or INTEGRATORS[integrator](robot.n_rods)
         self._mass_moves = inertia in ("condensed", "full")
         self._solver = make_solver(rods, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
         self._sag = CondensedWeight(robot) if weight == "condensed" else None
         self._at: tuple[float, ...] | None = None
         self._accuracy = 0.0  # of the derivatives there
-        n = robot.n_rods
-        tip_alone = np.diag([robot.tip_mass] * 2 + [0.0] * n)
-        self._mass = read_only(tip_alone), read_only(np.zeros(((2 + n) ** 2, 2 + n)))
+        self._mass = tip_mass(robot)
         self.payload = 0.0
         self._mass_at: tuple[float, ...] | None = None
-        self._condensed = None if inertia == "none" else BufferedFunction(robot_mass(robot))
+        self._condensed: CondensedMass | None = None
+        if inertia != "none":
+            assert isinstance(self._solver, RodSolver)
+            self._condensed = CondensedMass(robot, self._solver.method)
 
     def reset(self, x: Any, guess: Equilibrium | None = None) -> None:
         """Put the rods on the branch of ``guess`` at state x, or on the branch of least energy (None)."""
@@ -158,7 +158,8 @@ class Plant:
         if self._modal is not None:
             self._modal.forget()
         if self.inertia == "constant":
-            self._mass = self._condensed_mass(q)[0], self._mass[1]
+            assert self._condensed is not None
+            self._mass = self._condensed(self._unknowns(), q)[0], self._mass[1]
 
     def carry(self, payload: float, x: Any) -> np.ndarray:
         """Let the tip carry a payload besides its own mass from state x on; a `reset` takes it away.
@@ -278,7 +279,7 @@ class Plant:
         self._go(p, q, DERIVATIVE_ACCURACY)
         return self._solver.state
 
-    def mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def mass(self, p: np.ndarray, q: np.ndarray) -> MassMatrix:
         """Mass matrix at (p, q), following the branch, for the velocities w = [p', q'].
 
         Returns
@@ -290,11 +291,12 @@ class Plant:
         """
         return self.force_and_mass(p, q)[1] if self._mass_moves else self._mass
 
-    def force_and_mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    def force_and_mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, MassMatrix]:
         """`force` and `mass` at the same pose."""
         force = self.force(p, q)
         if self._mass_moves and self._mass_at is not self._at:
-            self._mass, self._mass_at = self._condensed_mass(q), self._at
+            assert self._condensed is not None
+            self._mass, self._mass_at = self._condensed(self._unknowns(), q, self.payload), self._at
         return force, self._mass
 
     def tip_velocity(self, x: Any, u: Any) -> np.ndarray:
@@ -355,27 +357,6 @@ class Plant:
                 rod=unstable[0],
             )
         self._at, self._accuracy = at, accuracy
-
-    def _condensed_mass(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """M and its derivatives at the last pose."""
-        assert self._condensed is not None
-        assert isinstance(self._solver, RodSolver)
-        graph = self._condensed
-        graph.inputs[0][:] = self._solver.state.unknowns
-        graph.inputs[1][:] = q
-        graph()
-        mass, slopes = (output.copy() for output in graph.outputs)
-        mass[0, 0] += self.payload
-        mass[1, 1] += self.payload
-        if not math.isfinite(slopes.sum()):
-            raise ConvergenceError(
-                f"the inertia of the rods at q = {q} rad has no finite derivative: a rod is straight and pushed; "
-                "keep away from this pose",
-                residual=math.nan,
-                iterations=0,
-                last=graph.inputs[0].copy(),
-            )
-        return read_only(mass), read_only(slopes)
 
 
 __all__ = ["INTEGRATORS", "ON_SNAP", "Plant"]

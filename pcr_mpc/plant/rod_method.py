@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from . import elastica, multiple_shooting
+from . import elastica, inertia, multiple_shooting, shooting_inertia
 from .chart import HeldShape
 from .robot import Robot
 from .rod import RodPhysics, aligned_steps, sample_rod
@@ -62,6 +62,8 @@ class RodMethod:
         (nodes (4, N), physics) -> list of unknowns: starts from an equilibrium or a guess, to be tried in this order.
     to_nodes : callable
         (unknowns, clamp angle, wanted number N) -> nodes (4, N); the shooting methods keep their own number.
+    mass : callable
+        () -> casadi.Function, the condensed inertia of a rod (see `inertia.rod_mass`); built when it is wanted.
     physics : tuple of RodPhysics or None
         Of each rod: the third argument of its graphs. None: plain rods, whose graphs have none.
     """
@@ -76,6 +78,7 @@ class RodMethod:
     from_shape: Callable[[HeldShape, float], np.ndarray]
     from_nodes: Callable[[np.ndarray, RodPhysics | None], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
+    mass: Callable[[], Any]
     physics: tuple[RodPhysics, ...] | None = None
 
     def physics_of(self, rod: int) -> RodPhysics | None:
@@ -108,6 +111,7 @@ def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
         to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
+        mass=lambda: shooting_inertia.rod_mass(n, steps, shooting.scheme, layout),
         physics=physics,
     )
 
@@ -127,6 +131,7 @@ def closed_form_method() -> RodMethod:
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=lambda nodes, _: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
         to_nodes=elastica.nodes,
+        mass=inertia.rod_mass,
     )
 
 
@@ -183,5 +188,10 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     record = ca.vertcat(*(ca.vec(ca.horzcat(*found)) for found in columns.values()))
     result = ca.vertcat(force, ca.vec(k), ca.vec(ca.horzcat(*g)))
     function = ca.Function("warm_step", [target, start_record], [record, verdict, result])
-    small = method.newton.n_instructions() <= _INLINED_INSTRUCTIONS
-    return function.expand("warm_step", {"cse": True}) if small else function
+    return inlined(function, method.newton)
+
+
+def inlined(function: Any, of_rod: Any) -> Any:
+    """Inline the graph of a rod into that of a robot that calls it, if it is small."""
+    small = of_rod.n_instructions() <= _INLINED_INSTRUCTIONS
+    return function.expand(function.name(), {"cse": True}) if small else function
