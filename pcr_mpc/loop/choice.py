@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from tqdm import tqdm
@@ -23,7 +23,7 @@ from .tracking import make_controller
 _SMALL_STEP, _PARTS = 0.2, (10, 20, 40)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measured:
     """A rung on the scene's motion.
 
@@ -36,12 +36,15 @@ class Measured:
         Of a plant step, median [s].
     failure : str
         Why it did not get to the end.
+    tips : ndarray, shape (K + 1, 2)
+        At its own steps [m], if it got to the end.
     """
 
     rung: PlantSettings
     error: float
     step_time: float
     failure: str = ""
+    tips: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
 
 
 @dataclass(frozen=True)
@@ -125,8 +128,8 @@ class Bench:
             raise NoRungError(f"{scene.name}: no rung can be simulated: {self.unavailable[-1][1]}", need=scene.need)
         self.yardstick = min(self.rungs, key=lambda rung: (self.estimates.total(rung), -height(scene, rung)))
         self._run = self._simulate(self.yardstick, None)
-        twice = self._simulate(replace(self.yardstick, dt=2 * dt), self._run.u)
-        self.step_error = self._distance(twice)
+        self._best = Measured(self.yardstick, 0.0, float(np.median(self._run.plant_time)), tips=self._run.x[:, :2])
+        self.step_error = self.measure(replace(self.yardstick, dt=2 * dt)).error
 
     @property
     def control_step(self) -> float | None:
@@ -140,20 +143,22 @@ class Bench:
         except SimulationError as error:
             times = error.run.plant_time
             return Measured(rung, math.inf, float(np.median(times)) if len(times) else math.nan, str(error))
-        return Measured(rung, self._distance(run), float(np.median(run.plant_time)))
+        measured = Measured(rung, math.nan, float(np.median(run.plant_time)), tips=run.x[:, :2])
+        return replace(measured, error=apart(measured, self._best))
 
     def _simulate(self, rung: PlantSettings, rates: np.ndarray | None) -> Run:
         scene = replace(self.scene, plant=rung)
         controller = make_controller(scene) if rates is None else Replay(rates)
         return simulate(scene, scene.make_plant(), controller)
 
-    def _distance(self, run: Run) -> float:
-        """Largest distance from the yardstick's tip at the times that both have [m]."""
-        coarse, fine = sorted((run, self._run), key=lambda one: -one.dt)
-        stride = round(coarse.dt / fine.dt)
-        with np.errstate(over="ignore"):
-            apart = np.linalg.norm(coarse.x[:, :2] - fine.x[::stride, :2], axis=1)
-        return float(apart.max())
+
+def apart(one: Measured, other: Measured) -> float:
+    """Largest distance of two rungs' tips at the times that both have [m]; infinite if one did not get to the end."""
+    coarse, fine = sorted((one, other), key=lambda each: len(each.tips))
+    if not len(coarse.tips):
+        return math.inf
+    stride = (len(fine.tips) - 1) // (len(coarse.tips) - 1)
+    return float(np.linalg.norm(coarse.tips - fine.tips[::stride], axis=1).max())
 
 
 def choose(scene: Scene, *, progress: bool = False) -> Choice:
@@ -237,7 +242,7 @@ def lowest(
     for candidate in physics:
         best = min(best, candidate.error)
         if candidate.error > allowed:
-            rejected.append(f"{named(candidate.rung)} {1e3 * (candidate.error + unmeasured):.3g} mm")
+            rejected.append(f"{named(scene, candidate.rung)} {1e3 * (candidate.error + unmeasured):.3g} mm")
             continue
         tried = []
         for rung in discretisations(scene, candidate.rung):
@@ -245,7 +250,7 @@ def lowest(
             if tried[-1].error <= allowed and tried[-1].step_time <= need.plant_step:
                 return tried, tried[-1]
         quickest = min((one.step_time for one in tried if one.error <= allowed), default=math.inf)
-        rejected.append(f"{named(candidate.rung)} {1e6 * quickest:.0f} us a step")
+        rejected.append(f"{named(scene, candidate.rung)} {1e6 * quickest:.0f} us a step")
     share = f", {1e3 * unmeasured:.2g} mm of each by which the yardstick may be off" if unmeasured else ""
     raise NoRungError(
         f"{scene.name} needs the tip to {1e3 * need.tip_accuracy:g} mm at {1e6 * need.plant_step:g} us a plant step, "

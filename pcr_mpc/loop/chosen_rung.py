@@ -73,7 +73,9 @@ def write_rung(choice: Choice, path: Path) -> None:
         draft.write_text(before + "\n".join([*lines, after]), encoding="utf-8")
         scene = load_scene(draft)
         if scene.plant.make(scene.robot).weight != (choice.chosen.rung.weight or "none"):
-            raise NoRungError(f"{path}: rung {named(choice.chosen.rung)} cannot be written", need=choice.scene.need)
+            raise NoRungError(
+                f"{path}: rung {named(choice.scene, choice.chosen.rung)} cannot be written", need=choice.scene.need
+            )
         lines += [*_finding(choice, digest(scene)), ""]
         draft.write_text(before + "\n".join([*lines, after]).rstrip() + "\n", encoding="utf-8")
         load_scene(draft)
@@ -96,7 +98,7 @@ def _finding(choice: Choice, of: str) -> list[str]:
     estimated = sum(estimate.error for estimate in choice.lacking.values())
     against: PlantSettings = choice.yardstick
     return [
-        f"[chosen]                  # against {named(against)}",
+        f"[chosen]                  # against {named(choice.scene, against)}",
         _line("tip_error", _rounded(1e3 * choice.tip_error), "mm, largest over the duration"),
         _line("estimated", _rounded(1e3 * estimated), "mm of it, for what the yardstick leaves out"),
         _line("digest", f'"{of}"', "of robot, motion, need and rung: tells whether this still holds"),

@@ -89,7 +89,7 @@ class Estimates:
         """Estimates of everything that a rung leaves out, by the name of the effect."""
         found: dict[str, Estimate] = {}
         for ladder, level in levels(rung).items():
-            found |= self._left_out(ladder, level)
+            found |= self.of_level(ladder, level)
         return found
 
     def total(self, rung: PlantSettings) -> float:
@@ -120,7 +120,8 @@ class Estimates:
             error, f"n (lambda h)^{order}/k, lambda = {loads.max():.2g}, h = 1/{rung.segments * rung.steps}"
         )
 
-    def _left_out(self, ladder: str, level: str) -> dict[str, Estimate]:
+    def of_level(self, ladder: str, level: str) -> dict[str, Estimate]:
+        """Estimates of what one level of a ladder leaves out, the highest level nothing."""
         scene, robot, k, a = self._scene, self._scene.robot, self._k, self._acceleration
         rods, gravity = robot.rods, float(np.linalg.norm(robot.gravity))
         if ladder == "inertia" and any(rod.line_density for rod in rods):

@@ -40,9 +40,10 @@ def levels(rung: PlantSettings) -> dict[str, str]:
     return {name: str(getattr(rung, name)) for name in ("inertia", "weight", "rods", "payload")}
 
 
-def named(rung: PlantSettings) -> str:
-    """Physics of a rung in words."""
-    return ", ".join(f"{name} {level}" for name, level in levels(rung).items())
+def named(scene: Scene, rung: PlantSettings) -> str:
+    """Physics of a rung in words: its levels on the ladders that the scene has."""
+    own, steps = levels(rung), ladders(scene)
+    return ", ".join(f"{name} {own[name]}" for name in own if len(steps[name]) > 1)
 
 
 def height(scene: Scene, rung: PlantSettings) -> int:
