@@ -177,7 +177,8 @@ def _track(options: argparse.Namespace) -> int:
     if options.plant:
         plant = MuJoCoPlant(scene.robot, links=_LINKS if options.links is None else options.links, dt=scene.plant.dt)
     elif options.method:
-        plant = replace(scene, plant=replace(scene.plant, method=options.method)).make_plant()
+        scene = replace(scene, plant=replace(scene.plant, method=options.method))
+        plant = scene.make_plant()
     folder = options.out or Path("results") / scene.name
     folder.mkdir(parents=True, exist_ok=True)  # rather now than after the run
     failure: SimulationError | None = None

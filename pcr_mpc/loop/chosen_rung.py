@@ -1,53 +1,19 @@
-"""The chosen rung in its scene file: written there, so that runs are repeatable, and known again by its digest."""
+"""The chosen rung written into its scene file, so that runs are repeatable."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
-from dataclasses import fields, is_dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from ..errors import ModelError, NoRungError
+from ..errors import ModelError
 from .choice import Choice
+from .finding import digest
 from .rungs import ladders, named
-from .scene import Scene, load_scene
+from .scene import load_scene
 from .settings import PlantSettings
 
 _DIGITS = 3  # of figures in a scene file
-
-
-def digest(scene: Scene) -> str:
-    """Digest of what the tip error of the scene's rung rests on: robot, motion, loads, need and rung.
-
-    Not the controller's tuning, whose part in the motion is small, and nothing that has its default, so that a new
-    property of robots does not make old findings void.
-    """
-    kept = ("robot", "duration", "start_tip", "start_motors", "start_mode", "start_velocity", "trajectory", "plant",
-            "period", "force", "delay", "payload", "need")  # fmt: skip
-    facts = {name: _facts(getattr(scene, name)) for name in kept}
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
-
-
-def _facts(value: Any) -> Any:
-    if is_dataclass(value):
-        given = {f.name: getattr(value, f.name) for f in fields(value) if getattr(value, f.name) != f.default}
-        return {"type": type(value).__name__, **{name: _facts(each) for name, each in given.items()}}
-    if isinstance(value, tuple):
-        return [_facts(each) for each in value]
-    return str(value) if isinstance(value, float) else value
-
-
-def verified(scene: Scene) -> bool:
-    """Whether the scene's rung was found to meet its need, and nothing that this rests on has changed since."""
-    need, finding = scene.need, scene.finding
-    return (
-        need is not None
-        and finding is not None
-        and finding.digest == digest(scene)
-        and finding.tip_error <= need.tip_accuracy
-    )
 
 
 def write_rung(choice: Choice, path: Path) -> None:
@@ -56,9 +22,7 @@ def write_rung(choice: Choice, path: Path) -> None:
     Raises
     ------
     ModelError
-        The file has no [plant] table of its own.
-    NoRungError
-        What was written would not be read back as it is; nothing is written.
+        The file has no [plant] table, or the rung does not read back as it is; nothing is written.
     """
     text = path.read_text(encoding="utf-8")
     text = re.sub(r"(?ms)^\[chosen\].*?(?=^\[|\Z)", "", text)
@@ -72,10 +36,10 @@ def write_rung(choice: Choice, path: Path) -> None:
     try:
         draft.write_text(before + "\n".join([*lines, after]), encoding="utf-8")
         scene = load_scene(draft)
-        if scene.plant.make(scene.robot).weight != (choice.chosen.rung.weight or "none"):
-            raise NoRungError(
-                f"{path}: rung {named(choice.scene, choice.chosen.rung)} cannot be written", need=choice.scene.need
-            )
+        # A weight that nobody asks for is none.
+        if replace(scene.plant, weight=scene.plant.weight or "none", on_snap="raise") != choice.chosen.rung:
+            rung = named(choice.scene, choice.chosen.rung)
+            raise ModelError(f"{path}: rung {rung} does not read back as it is", file=str(path), key="plant")
         lines += [*_finding(choice, digest(scene)), ""]
         draft.write_text(before + "\n".join([*lines, after]).rstrip() + "\n", encoding="utf-8")
         load_scene(draft)

@@ -59,6 +59,13 @@ class PlantSettings:
             weight=self.weight,
         )
 
+    def describes(self, plant: object) -> bool:
+        """Whether a plant is simulated like this."""
+        if not isinstance(plant, Plant):
+            return False
+        own = self.method, self.integrator, self.dt, self.inertia
+        return own == (plant.method, plant.integrator, plant.dt, plant.inertia)
+
 
 @dataclass(frozen=True)
 class Need:
@@ -88,7 +95,7 @@ class Finding:
     estimated : float
         The part of it that is estimated, not measured [m].
     digest : str
-        Of all that it rests on (see `chosen_rung.digest`).
+        Of all that it rests on (see `finding.digest`).
     """
 
     tip_error: float

@@ -101,6 +101,7 @@ def simulate(
             slack=slack,
             rungs=plant.rungs,
             events=events,
+            rung=scene.plant if scene.plant.describes(plant) else None,
         )
 
     try:

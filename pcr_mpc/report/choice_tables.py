@@ -70,8 +70,8 @@ def choice_table(choice: Choice) -> str:
         "",
         _left(table(("what leaving it out costs, estimated", "mm", "why"), effects)),
         "",
-        f"yardstick: {named(scene, choice.yardstick)}; {choice.yardstick.integrator} at {1e3 * choice.yardstick.dt:g} ms, "
-        f"twice that changes {_mm(choice.step_error)} mm",
+        f"yardstick: {named(scene, choice.yardstick)}; {discretisation(choice.yardstick)}, "
+        f"twice that step changes {_mm(choice.step_error)} mm",
         *(f"  it lacks {name}: {_mm(estimate.error)} mm are added" for name, estimate in choice.lacking.items()),
         "",
         table(("a step up, the rest as in the yardstick", "mm"), steps),
