@@ -2,7 +2,8 @@
 
 For every scene in models/scenes with a [need] table: the largest error of the tip of each rung against the scene's
 yardstick, driven by the same motor rates, over the time of a plant step (RK4, or Gauss collocation with distributed
-rods; see `pcr-mpc choose`). The need is a line, the rung that the scene gets is ringed. Writes a CSV and a picture.
+rods; see `pcr-mpc choose`). The yardstick is drawn at the bottom. The need is a line, the rung that the scene gets is
+ringed, and the star is that rung in the cheapest discretisation that will do. Writes a CSV and a picture.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def left_out(choice: Choice, rung: dict[str, str]) -> tuple[str, ...]:
 
 def plot(choices: list[Choice], path: Path) -> None:
     """A panel for each scene."""
-    figure, panels = plt.subplots(2, 4, figsize=(12.5, 6.6), sharex=True, sharey=True)
+    figure, panels = plt.subplots(2, 4, figsize=(11, 6.4), sharex=True, sharey=True)
     used: set[tuple[str, ...]] = set()
     for axes, choice in zip(panels.flat, choices, strict=False):
         need = choice.scene.need
@@ -71,11 +72,13 @@ def plot(choices: list[Choice], path: Path) -> None:
             axes.plot(*at, MARKERS[without][0], color=colour, ms=6, alpha=0.9, zorder=3)
             if chosen:
                 axes.plot(*at, "o", ms=14, mfc="none", mec="black", mew=1.5, zorder=4)
+        run = choice.chosen
+        axes.plot(1e6 * run.step_time, 1e3 * run.error, "*", color="black", ms=9, mec="white", mew=0.6, zorder=5)
         allowed = 1e3 * need.tip_accuracy
         axes.axhline(allowed, color=GREY, ls="--", lw=1.2)
-        style = {"ha": "right", "va": "bottom", "fontsize": 9, "color": "#444444"}
+        style = {"ha": "right", "va": "top", "fontsize": 9, "color": "#444444"}
         axes.annotate(f"need {allowed:g} mm", (0.98, allowed), xycoords=("axes fraction", "data"), **style)
-        axes.set(xscale="log", yscale="log", title=choice.scene.name, xlim=(50, 2e4), ylim=(FLOOR / 2, 2e2))
+        axes.set(xscale="log", yscale="log", title=choice.scene.name, xlim=(20, 2e4), ylim=(FLOOR / 2, 2e2))
         axes.tick_params(labelbottom=True)
     for axes in panels[:, 0]:
         axes.set_ylabel("largest tip error [mm]")
@@ -89,7 +92,8 @@ def plot(choices: list[Choice], path: Path) -> None:
                 for without, (marker, words) in MARKERS.items() if without in used]  # fmt: skip
     ring = {"marker": "o", "ms": 12, "mfc": "none", "mec": "black", "mew": 1.5}
     handles.append(plt.Line2D([], [], ls="", label="chosen", **ring))
-    legend.legend(handles=handles, loc="center left", bbox_to_anchor=(-0.12, 0.5), fontsize=9, title="rungs")
+    handles.append(plt.Line2D([], [], ls="", marker="*", ms=9, color="black", label="as it is run, cheaper"))
+    legend.legend(handles=handles, loc="center left", bbox_to_anchor=(-0.2, 0.5), fontsize=9, title="rungs")
     figure.tight_layout()
     figure.savefig(path)
     plt.close(figure)

@@ -1,36 +1,23 @@
-"""The choice of a scene's physics: made-up measurements, short motions, and what the shipped scenes carry."""
+"""The choice of a scene's physics: made-up measurements, estimates, short motions."""
 
 import json
 import math
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pcr_mpc import ConvergenceError, ModelError, load_scene
-from pcr_mpc.cli import main
+from pcr_mpc import ConvergenceError, load_scene
 from pcr_mpc.errors import NoRungError
 from pcr_mpc.loop.choice import Bench, Measured, apart, choose, lowest
-from pcr_mpc.loop.chosen_rung import write_rung
 from pcr_mpc.loop.estimates import Estimates
-from pcr_mpc.loop.finding import digest, verified
 from pcr_mpc.loop.rungs import all_physics, discretisations, ladders, levels, named
 from pcr_mpc.loop.settings import Need, PlantSettings
 from pcr_mpc.report.choice_tables import choice_record, choice_table
 
-from .conftest import CONTROLLERS, MODELS
+from .conftest import MODELS
 
 SCENES = MODELS / "scenes"
-CHOSEN = {
-    "hold_slow": {"inertia": "none"},
-    "release": {"inertia": "condensed"},
-    "heavy_rods": {"inertia": "condensed", "weight": "condensed"},
-    "vertical": {"inertia": "none", "weight": "condensed"},
-    "curved_rods": {"inertia": "none", "rods": "as_built"},
-    "near_straight": {"inertia": "none", "weight": "exact", "rods": "as_built"},
-    "payload": {"inertia": "constant", "payload": "carried"},
-}
 ANY_TIME = {"plant_step": 1.0, "control_step": 10.0}  # s
 
 
@@ -277,7 +264,7 @@ def test_payload_and_control_step_are_measured():
 
 def test_table_and_record(release, choice):
     text = choice_table(choice)
-    for words in ("release needs the tip to 0.002 mm", "g K^-1 dM a", "inertia: none -> constant", "us a step",
+    for words in ("release needs the tip to 0.002 mm", "K^-1 dM a", "inertia: none -> constant", "us a step",
                   "chosen: inertia condensed", "yardstick: inertia full", "no lower rung is, the best"):  # fmt: skip
         assert words in text
     record = json.loads(json.dumps(choice_record(choice), allow_nan=False))
@@ -292,86 +279,3 @@ def test_table_and_record(release, choice):
 def test_a_scene_without_need_is_refused():
     with pytest.raises(ValueError, match=r"lemniscate states no need; give it a \[need\] table"):
         choose(load_scene(SCENES / "lemniscate.toml"))
-
-
-# --- in scene files ---------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def file(tmp_path):
-    shutil.copytree(MODELS, tmp_path / "models")
-    shutil.copytree(CONTROLLERS, tmp_path / "controllers")
-    path = tmp_path / "models/scenes/release.toml"
-    text = (
-        path.read_text().replace("duration = 1.0", "duration = 0.4").replace("plant_step = 1000.0", "plant_step = 1e6")
-    )
-    path.write_text(text)
-    return path
-
-
-def test_the_chosen_rung_is_written_and_known_again(file, choice, capsys):
-    assert not verified(load_scene(file))
-    assert main(["choose", str(file), "--write"]) == 0
-    assert "chosen: inertia condensed" in capsys.readouterr().out
-    text, scene = file.read_text(), load_scene(file)
-    assert replace(scene.plant, weight="none") == choice.chosen.rung
-    assert scene.finding.tip_error == pytest.approx(choice.tip_error, rel=1e-2)
-    assert verified(scene)
-    assert text.count("[plant]") == text.count("[chosen]") == 1
-    write_rung(choice, file)
-    assert file.read_text() == text
-    assert "# motors fixed" in text  # comments of other tables stay
-    # What it rests on has changed:
-    for changed in (replace(scene, duration=0.5), replace(scene, plant=replace(scene.plant, dt=2e-3)),
-                    replace(scene, robot=replace(scene.robot, tip_mass=0.3)),
-                    replace(scene, need=replace(scene.need, tip_accuracy=1e-9))):  # fmt: skip
-        assert not verified(changed)
-    assert digest(replace(scene, name="other")) == digest(scene)
-
-
-def test_track_records_rung_and_need(file, choice, tmp_path, capsys):
-    write_rung(choice, file)
-    arguments = ["track", str(file), "--out", str(tmp_path / "out"), "--no-pictures"]
-    assert main([*arguments, "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    assert summary["rung"]["inertia"] == "condensed"
-    assert summary["need"]["verified"]
-    assert summary["need"]["tip_error_mm"] <= summary["need"]["tip_accuracy_mm"] == 0.002
-    assert summary["need"]["plant_step_met"]
-    with np.load(tmp_path / "out/run.npz") as stored:
-        assert json.loads(str(stored["rung"])) == summary["rung"]
-        assert json.loads(str(stored["need"])) == summary["need"]
-    assert main([*arguments, "--method", "multiple_shooting"]) == 0
-    text = capsys.readouterr().out
-    assert "rung        inertia condensed" in text
-    assert "tip to 0.002 mm: not verified; see pcr-mpc choose" in text
-
-
-def test_a_scene_file_without_plant_is_refused(tmp_path, choice):
-    path = tmp_path / "scene.toml"
-    path.write_text('name = "nothing"\n')
-    with pytest.raises(ModelError, match=r"has no \[plant\] table"):
-        write_rung(choice, path)
-    assert path.read_text() == 'name = "nothing"\n'
-
-
-def test_the_seven_scenes_carry_verified_rungs_of_their_own():
-    rungs = {}
-    for path in sorted(SCENES.glob("*.toml")):
-        scene = load_scene(path)
-        if scene.need is not None:
-            assert verified(scene), f"{scene.name}: run pcr-mpc choose {path} --write"
-            rungs[scene.name] = {
-                name: level for name, level in levels(scene.plant).items() if len(ladders(scene)[name]) > 1
-            }
-    assert rungs == CHOSEN
-    assert len({tuple(rung.items()) for rung in rungs.values()}) == 7
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CHOSEN)
-def test_the_scenes_need_the_rungs_that_they_carry(name):
-    scene = load_scene(SCENES / f"{name}.toml")
-    found = choose(replace(scene, need=replace(scene.need, **ANY_TIME)))
-    assert found.chosen.rung == replace(scene.plant, weight=scene.plant.weight or "none")
-    assert found.tip_error == pytest.approx(scene.finding.tip_error, rel=0.05)

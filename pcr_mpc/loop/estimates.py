@@ -130,10 +130,18 @@ class Estimates:
             whole, change = (self._gain * a * self._give(masses) for masses in (added, changes))
             gram = 1e3 * float(max(np.linalg.norm(mass, 2) for mass in added))
             if level == "none":
-                return {"rods' inertia": Estimate(whole, f"up to {gram:.2g} g of the rods move with it: g K^-1 dM a")}
+                return {
+                    "rods' inertia": Estimate(
+                        whole, f"up to {gram:.2g} g of the rods move with it: {self._gain:.2g} K^-1 dM a"
+                    )
+                }
             if level == "constant":
                 gram = 1e3 * float(max(np.linalg.norm(mass, 2) for mass in changes))
-                return {"change of inertia": Estimate(change, f"by up to {gram:.2g} g along the way: g K^-1 dM a")}
+                return {
+                    "change of inertia": Estimate(
+                        change, f"by up to {gram:.2g} g along the way: {self._gain:.2g} K^-1 dM a"
+                    )
+                }
             if level == "condensed":
                 ratio = self.slowest / min(_FREQUENCY * math.sqrt(_natural(rod)) for rod in rods)
                 reason = f"their inertia's times (omega/omega_rod)^2, {ratio:.2g}^2"
