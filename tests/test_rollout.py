@@ -232,6 +232,25 @@ def test_a_reset_forgets_the_branch_of_the_steps_before(pair, centre):
     assert plant.equilibrium(x).mode == "LR"
 
 
+@pytest.mark.parametrize("inertia", ["none", "condensed"])
+def test_payloads(pair, centre, inertia):
+    """A step knows what the tip carries; a rollout begins with a reset, and without a payload."""
+    x, inputs = start_at(centre), brisk(20)
+    plant, parts, other = (Plant(pair, integrator="velocity_verlet", inertia=inertia) for _ in range(3))
+    parts = in_parts(parts)
+    ends = []
+    for one in (plant, parts):
+        states = one_by_one(one, x, inputs, (0, 0), centre)
+        end = one.carry(0.1, states[-1])
+        for u in inputs:
+            end = one.step(end, u)
+        ends.append(end)
+    assert ends[0] == pytest.approx(ends[1], abs=1e-10)
+    assert plant.payload == 0.1
+    assert (rollout(plant, x, inputs, guess=centre).x == rollout(other, x, inputs, guess=centre).x).all()
+    assert plant.payload == 0.0
+
+
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 def test_machine_code_gives_the_same_numbers(pair, centre):
     x, inputs = start_at(centre), 0.1 * brisk(STEPS)

@@ -60,7 +60,7 @@ def rollout(
     """Move robots through sequences of inputs that are known in advance, up to a thousand steps in one call.
 
     The result is that of `Plant.step` from ``plant.reset(x0, guess)`` on, to the tolerance of the statics; errors are
-    those of `Plant.step`, too. The plant is used for that, and afterwards is wherever that left it.
+    those of `Plant.step`, too. The plant is used for that: it loses a payload, and ends wherever that left it.
 
     Parameters
     ----------
@@ -85,8 +85,7 @@ def rollout(
     ValueError
         A plant that has no such graph, or an argument that is not finite or of the wrong shape.
     """
-    model = plant.step_model
-    if model is None:
+    if plant.step_model is None:
         raise ValueError(f"method {plant.method!r} with inertia {plant.inertia!r} has no rollout; use Plant.step")
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
         raise ValueError(f"threads is {threads!r}, expected a whole number of at least 1")
@@ -94,6 +93,7 @@ def rollout(
     robots, steps = inputs.shape[:2]
     x, residual = np.empty((robots, steps + 1, plant.n_states)), np.empty((robots, steps))
     memories = _memories(plant, starts, guess)
+    model = plant.step_model  # after the resets, which take a payload away
     at_once = max(1, _MOST_STEPS // min(steps, _STEPS))
     done = np.zeros(robots, dtype=bool)
     for corrections in CORRECTIONS:
