@@ -32,7 +32,6 @@ pictures in docs/ are those of --seeds 6.
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +53,7 @@ from pcr_mpc import (
 from pcr_mpc.plant import elastica
 from pcr_mpc.plant.chart import critical_load
 from pcr_mpc.plant.rod import sample_rod
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt
 
 Row = dict[str, Any]
@@ -438,14 +438,6 @@ def plot_shares(trials: list[Row], path: Path) -> None:
     plt.close(figure)
 
 
-def write_csv(rows: list[Row], path: Path) -> None:
-    """Write rows that all have the first one's keys."""
-    with open(path, "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=list(rows[0]), restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def main() -> None:
     """Measure, write the tables, plot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -463,7 +455,7 @@ def main() -> None:
     trials, poses = measure(load_robot(Path(__file__).parent.parent / "models" / "planar_pair.toml"), plan)
     halves = half_sizes(trials, plan)
     for name, rows in {"trials": trials, "poses": poses, "summary": summarise(trials), "half": halves}.items():
-        write_csv(rows, folder / f"basins_{name}.csv")
+        write_rows(folder / f"basins_{name}.csv", rows)
     plot_halves(halves, folder / "basins.png")
     plot_shares(trials, folder / "basins_shares.png")
     print(f"written to {folder}")

@@ -18,7 +18,6 @@ Writes linear_validity_map.csv, _horizon.csv, _loop.csv and the picture linear_v
 from __future__ import annotations
 
 import argparse
-import csv
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
@@ -50,6 +49,7 @@ from pcr_mpc.loop.controllers import Controller, Decision
 from pcr_mpc.loop.feed_forward import feed_forward
 from pcr_mpc.loop.tracking import motor_limits
 from pcr_mpc.loop.trajectory import Lemniscate
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREY, RED, plt
 
 MODELS = Path(__file__).parent.parent / "models"
@@ -428,16 +428,6 @@ def plot(map_rows: list[Row], spacing: float, loop_rows: list[Row], scene: Scene
     plt.close(figure)
 
 
-def write_csv(rows: list[Row], path: Path) -> None:
-    """Write rows whose columns may differ; numbers to six digits."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with open(path, "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=names)
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-
-
 def report(map_rows: list[Row], horizon_rows: list[Row], loop_rows: list[Row]) -> None:
     """Print the main figures."""
     print(f"map: {np.isfinite(column(map_rows, 'tip_radius_mm')).sum()} poses, {len(map_rows)} tips tried")
@@ -479,7 +469,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     cases += [(lap, reach, 1.0) for lap in LAPS for reach in LIMITED_REACHES]
     loop_rows = measure_loop(scene, [(1.0, 60.0, FREE)] if quick else cases)
     for name, rows in (("map", map_rows), ("horizon", horizon_rows), ("loop", loop_rows)):
-        write_csv(rows, options.out / f"linear_validity_{name}.csv")
+        write_rows(options.out / f"linear_validity_{name}.csv", rows, digits=6)
     plot(map_rows, spacing, loop_rows, scene, options.out / "linear_validity.png")
     report(map_rows, horizon_rows, loop_rows)
     print(f"written to {options.out}")

@@ -13,7 +13,6 @@ kept in episodes.jsonl: the same command, given again, goes on where the last on
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import math
 import sys
@@ -32,6 +31,7 @@ from pcr_mpc import PCRError, Scene, SimulationError, Tuning, load_scene, load_t
 from pcr_mpc.loop.episodes import ALLOWED_ERROR, SETTLING, Spread, lighter, run_episode, simulate_episode
 from pcr_mpc.loop.parallel import collect, local_workers
 from pcr_mpc.loop.provenance import described, source_digest
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.plots import animate_run, plot_run
 from pcr_mpc.report.style import BLUE, GREY, ORANGE, RED, plt
 from pcr_mpc.report.tables import summary_table, table
@@ -187,15 +187,6 @@ def plot(rows: list[Row], title: str, path: Path) -> None:
     plt.close(figure)
 
 
-def write_csv(rows: list[Row], path: Path) -> None:
-    """Write what repeats bit for bit."""
-    columns = [name for name in rows[0] if name != "timing"]
-    with open(path, "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=columns, extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 @contextmanager
 def workers(jobs: int | None, dask: str | None) -> Iterator[Executor]:
     """Open processes on this machine, or a Dask cluster."""
@@ -279,7 +270,8 @@ def _study(options: argparse.Namespace) -> int:
     summary = summarise(rows)
     timing = [row["timing"] for row in rows if row["timing"]["control_cpu_us"] is not None]
     measured = {name: quantiles(timing, name) for name in ("control_cpu_us", "episode_s")}
-    write_csv(rows, folder / "episodes.csv")
+    # What repeats bit for bit.
+    write_rows(folder / "episodes.csv", rows, [name for name in rows[0] if name != "timing"])
     (folder / "summary.json").write_text(json.dumps({**summary, "timing": measured}, indent=2) + "\n")
     plot(rows, f"{scene.name}, controller {tuning.name}", folder / "monte_carlo.png")
     print(f"\n{report(summary, _again(options))}\n\nwritten to {folder}")

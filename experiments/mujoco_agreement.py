@@ -16,7 +16,6 @@ Writes a CSV for each part and a picture. Run as ``python -m experiments.mujoco_
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from dataclasses import replace
 from importlib.util import find_spec
@@ -31,6 +30,7 @@ from pcr_mpc import PCRError, Plant, Robot, load_robot, load_scene, make_control
 from pcr_mpc.plant.hinge_chain import settled_chains
 from pcr_mpc.plant.mjcf import coordinates, mjcf
 from pcr_mpc.plant.mujoco_plant import MuJoCoPlant
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, ORANGE, PURPLE, plt
 
 Row = dict[str, object]
@@ -173,16 +173,6 @@ def plot(rows: list[Row], path: Path) -> None:
     plt.close(figure)
 
 
-def write(rows: list[Row], fields: list[str], path: Path) -> None:
-    """Write rows as CSV."""
-    with open(path, "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=fields, restval="")
-        writer.writeheader()
-        writer.writerows(
-            {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()} for row in rows
-        )
-
-
 def main() -> None:
     """Measure, write the CSVs, plot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -194,15 +184,11 @@ def main() -> None:
     mujoco.set_mju_user_warning(lambda _: None)  # a blow-up is a row of the table, not a log file
     robot = load_robot(MODELS / "planar_pair.toml")
     rows = [row for release in tqdm(RELEASES, desc="releases") for row in agreement(robot, release, duration)]
-    write(
-        rows,
-        ["release", "what", "links", "step_us", "radius_mm", "error_mm", "s_per_s", "gap_um", "failure"],
-        folder / "mujoco_agreement.csv",
-    )
+    fields = ["release", "what", "links", "step_us", "radius_mm", "error_mm", "s_per_s", "gap_um", "failure"]
+    write_rows(folder / "mujoco_agreement.csv", rows, fields, digits=6)
     plot(rows, folder / "mujoco_agreement.png")
-    write(
-        loops(arguments.quick), ["scene", "plant", "observer", "none_mm", "condensed_mm"], folder / "mujoco_loops.csv"
-    )
+    fields = ["scene", "plant", "observer", "none_mm", "condensed_mm"]
+    write_rows(folder / "mujoco_loops.csv", loops(arguments.quick), fields, digits=6)
     print(f"written to {folder}")
 
 

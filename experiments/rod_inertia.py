@@ -11,7 +11,6 @@ are rows with the reason. Writes a CSV and a picture.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pcr_mpc import Equilibrium, PCRError, Plant, Robot, inverse_statics, load_robot, solve_statics
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, plt
 
 Row = dict[str, object]
@@ -146,10 +146,7 @@ def main() -> None:
     rows = [row for case in tqdm(cases, desc="releases", unit="case") for row in compare(robot, *case, duration)]
     fields = ["release", "mass", "inertia", "error_mm", "by_modes_mm", "by_step_mm", "swing_mm"]
     fields += ["velocity_verlet_us", "rk4_us", "gauss_us", "failure"]
-    with open(folder / "rod_inertia.csv", "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=fields, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(folder / "rod_inertia.csv", rows, fields)
     plot(rows, folder / "rod_inertia.png")
     print(f"written to {folder}")
 

@@ -9,7 +9,6 @@ Writes two CSVs and a picture.
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from pcr_mpc import (
     inverse_statics,
     load_robot,
 )
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, RED, plt
 
 Row = dict[str, object]
@@ -136,10 +136,7 @@ def main() -> None:
     held = held_tip(robot, centre, arguments.angles)
     free = free_tip(robot, centre, arguments.angles)
     for name, rows in (("snap_held", held), ("snap_free", free)):
-        with open(folder / f"{name}.csv", "w", newline="", encoding="utf-8") as handle:
-            writer = csv.DictWriter(handle, fieldnames=list(rows[0]), restval="")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_rows(folder / f"{name}.csv", rows)
     plot(held, free, folder / "snap.png")
     print(f"written to {folder}")
 

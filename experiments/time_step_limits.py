@@ -10,7 +10,6 @@ keeps exactly, against dt. Writes two CSVs and two pictures.
 from __future__ import annotations
 
 import argparse
-import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pcr_mpc import Equilibrium, PCRError, Plant, Robot, inverse_statics, load_robot
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, plt
 
 PREDICTED = {"semi_implicit_euler": 2.0, "velocity_verlet": 2.0, "rk4": 2.0 * np.sqrt(2.0)}
@@ -155,10 +155,7 @@ def main() -> None:
     steps = [2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3, 8e-3]
     swings = [swing(robot, integrator, dt) for dt in tqdm(steps, desc="swings", unit="dt") for integrator in PREDICTED]
     for name, table in (("time_step_limits", rows), ("energy_drift", swings)):
-        with open(folder / f"{name}.csv", "w", newline="", encoding="utf-8") as handle:
-            writer = csv.DictWriter(handle, fieldnames=list(table[0]))
-            writer.writeheader()
-            writer.writerows(table)
+        write_rows(folder / f"{name}.csv", table)
     plot(rows, folder / "time_step_limits.png")
     plot_energy(swings, folder / "energy_drift.png")
     print(f"written to {folder}")

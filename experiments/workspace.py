@@ -22,7 +22,6 @@ with the points found on the edges, each within 5e-4 rad of arc (5e-5 m of tip m
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 from collections import Counter, deque
 from dataclasses import dataclass, field
@@ -39,6 +38,7 @@ from tqdm import tqdm
 from pcr_mpc import Equilibrium, PCRError, Robot, assess_stability, inverse_statics, load_robot
 from pcr_mpc.plant.rod_method import closed_form_method
 from pcr_mpc.plant.rod_solver import RodSolver
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import GREY, ORANGE, PURPLE, RED, SKY, plt
 
 Site = tuple[int, int]
@@ -500,14 +500,6 @@ def unwrapped(angles: np.ndarray) -> np.ndarray:
     return np.asarray(angles[..., :1, :] + turn_between(angles[..., :1, :], angles))
 
 
-def write(path: Path, columns: tuple[str, ...], rows: list[dict[str, object]]) -> None:
-    """CSV with a header."""
-    with open(path, "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=columns, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def main() -> None:
     """Explore each mode, write the CSVs, draw, print the areas."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -530,8 +522,8 @@ def main() -> None:
         figures = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in areas(sheet).items())
         ends = Counter(end.reason for end in sheet.ends.values())
         print(f"mode {mode}: areas in L^2: {figures}; points on the edge: {dict(ends)}")
-    write(options.out / "workspace.csv", POSE_COLUMNS, poses)
-    write(options.out / "workspace_edge.csv", EDGE_COLUMNS, edges)
+    write_rows(options.out / "workspace.csv", poses, POSE_COLUMNS)
+    write_rows(options.out / "workspace_edge.csv", edges, EDGE_COLUMNS)
     print(f"written to {options.out}")
 
 

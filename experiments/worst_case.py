@@ -8,7 +8,6 @@ somebody else's. Writes worst_case.csv.
 from __future__ import annotations
 
 import argparse
-import csv
 import gc
 from collections import Counter
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pcr_mpc import Scene, SimulationError, load_scene, make_controller, simulate
+from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.tables import table
 
 SCENES = Path(__file__).parent.parent / "models" / "scenes"
@@ -65,11 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     scenes = [load_scene(path) for path in sorted(SCENES.glob("*.toml"))]
     rows = [measure(scene, options.steps) for scene in scenes if scene.trajectory is not None]
-    options.out.mkdir(parents=True, exist_ok=True)
-    with open(options.out / "worst_case.csv", "w", newline="", encoding="utf-8") as handle:
-        writer = csv.DictWriter(handle, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(options.out / "worst_case.csv", rows)
     cells = [[f"{v:.0f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
     print(table(list(rows[0]), cells))
 

@@ -13,6 +13,7 @@ from pcr_mpc import load_scene, make_controller, simulate
 from pcr_mpc.loop import episodes
 from pcr_mpc.loop.controllers import HoldMotors
 from pcr_mpc.loop.episodes import ALLOWED_ERROR, EXACT, Spread, run_episode, simulate_episode
+from pcr_mpc.loop.feed_forward import feed_forward
 from pcr_mpc.loop.trajectory import Hold
 
 from .conftest import MODELS
@@ -71,8 +72,8 @@ def test_the_robot_is_another_and_the_controller_does_not_know(scene, monkeypatc
     """The sampled robot moves; the controller is given the scene's, but for its encoders' data sheet."""
     given = {}
 
-    def spy(believed, robot):
-        given.update(scene=believed, robot=robot)
+    def spy(believed, robot, reference):
+        given.update(scene=believed, robot=robot, reference=reference)
         return HoldMotors(robot.n_rods)
 
     monkeypatch.setattr(episodes, "make_controller", spy)
@@ -83,6 +84,8 @@ def test_the_robot_is_another_and_the_controller_does_not_know(scene, monkeypatc
     true = run.scene
     assert given["robot"] == given["scene"].robot == scene.robot
     assert given["scene"] == replace(scene, angle_step=true.angle_step)
+    # So does what it feeds forward: the inverse dynamics are those of the scene's robot, not of the sampled one.
+    assert given["reference"].states[0, 4:] == pytest.approx(scene.start().q, abs=1e-9)
     for rod, nominal, factor, offset in zip(
         true.robot.rods, scene.robot.rods, mismatch.stiffness, mismatch.base_offset, strict=True
     ):
@@ -106,6 +109,34 @@ def test_a_shorter_period_does_not_make_the_bus_faster(scene, period, delay):
     run = simulate_episode(replace(scene, duration=0.04), replace(scene.tuning, period=period), seed)
     assert run.scene.delay == delay
     assert run.scene.period == (period or scene.period)
+
+
+def test_the_reference_is_solved_once_and_is_the_same(scene, monkeypatch):
+    """For all episodes of a scene, whatever else is tuned; a run that solves it by itself is equal bit for bit."""
+    solved = []
+
+    def counting(believed, robot, pose, horizon, inertia):
+        solved.append(horizon)
+        return feed_forward(believed, robot, pose, horizon, inertia)
+
+    monkeypatch.setattr(episodes, "feed_forward", counting)
+    scene = replace(scene, duration=0.11, delay=1)  # of no other test
+    first, _, third = (simulate_episode(scene, scene.tuning, seed, spread) for seed, spread in
+                       ((0, EXACT), (1, Spread()), (0, EXACT)))  # fmt: skip
+    simulate_episode(scene, replace(scene.tuning, input_weight=0.3, observer=None), 0)
+    assert solved == [scene.tuning.horizon + 1]
+    by_itself = simulate(scene, scene.make_plant(), make_controller(scene))
+    assert first.hash() == third.hash() == by_itself.hash()
+    simulate_episode(scene, replace(scene.tuning, period=0.005), 0)
+    simulate_episode(replace(scene, trajectory=Hold((0.0, 0.25))), scene.tuning, 0)
+    simulate_episode(scene, replace(scene.tuning, model=replace(scene.tuning.model, inertia="constant")), 0)
+    assert len(solved) == 4
+
+
+def test_a_reference_that_is_too_short_is_refused(scene):
+    short = feed_forward(scene, scene.robot, scene.start(), scene.tuning.horizon - 1)
+    with pytest.raises(ValueError, match="reference has 39 periods; scene and horizon need 40"):
+        make_controller(scene, reference=short)
 
 
 def test_only_rk4_is_replaced(scene):

@@ -7,12 +7,14 @@ import threading
 import time
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from ..control.tuning import Tuning
 from ..errors import SimulationError, checked_number
+from .feed_forward import InverseDynamics, feed_forward
 from .run import Run
 from .scene import Scene
 from .simulate import simulate
@@ -186,8 +188,20 @@ def simulate_episode(
     # A tuning with a shorter period does not make the bus faster.
     delay = math.ceil(mismatch.delay * scene.period / believed.period - 1e-9)
     true = replace(mismatch, delay=delay).applied_to(believed)
-    controller = make_controller(replace(believed, angle_step=true.angle_step), robot=believed.robot)
+    reference = None
+    if believed.trajectory is not None:
+        tail = tuning.horizon + believed.delay
+        reference = _reference(replace(believed, tuning=None), tail, tuning.model.inertia)
+    controller = make_controller(
+        replace(believed, angle_step=true.angle_step), robot=believed.robot, reference=reference
+    )
     return simulate(true, true.make_plant(), controller, seed, progress=progress)
+
+
+@lru_cache(maxsize=8)
+def _reference(believed: Scene, horizon: int, inertia: str) -> InverseDynamics:
+    """Inverse dynamics of the reference: what is believed is the same in all episodes, so they are solved once."""
+    return feed_forward(believed, believed.robot, believed.start(), horizon, inertia)
 
 
 def run_episode(scene: Scene, tuning: Tuning, seed: int, spread: Spread = Spread()) -> Row:

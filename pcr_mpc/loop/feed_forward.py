@@ -2,43 +2,128 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..control.qp import Reference
-from ..errors import PCRError
+from ..errors import ConvergenceError, PCRError
+from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import inverse_statics
 from ..plant.robot import Robot
 from .scene import Scene
 
+# The motor angles' change by the rods' inertia is found again from the angles that it leads to, until it settles [rad]:
+# each time the error falls as the rods' share of the mass, 1/200 of the change on the default robot.
+_SETTLED = 1e-5
+_MOST_SWEEPS = 20
 
-def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int) -> Reference:
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InverseDynamics(Reference):
+    """What the reference asks of the motors at K times from the start on.
+
+    Attributes
+    ----------
+    states : ndarray, shape (K, 4 + n)
+    inputs : ndarray, shape (K - 1, n)
+        Rates that lead from each state to the next [rad/s].
+    forces : ndarray, shape (K, 2)
+        That the rods carry [N].
+    angles_per_force : ndarray, shape (K, n, 2)
+        Least change of the motor angles by which they carry one more newton [rad/N].
+    """
+
+    angles_per_force: np.ndarray
+
+
+def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, inertia: str = "none") -> InverseDynamics:
     """Inverse dynamics of the reference at every period, and one horizon beyond the end.
 
     The motor angles are those at which the rods carry F = -m a - c v on the reference; the rates lead from
     each to the next.
 
-    Returns
-    -------
-    Reference
-        At K times from the start on: states (K, 4 + n), inputs (K - 1, n), forces (K, 2).
+    Where the rods have inertia, F = -pi' + dT/dp - c v with the momentum pi = M_pp v + M_pq q' and the kinetic energy
+    T = w' M w / 2, w = [v, q'] (see `integrators`), differences taken from period to period. M and q' are those of the
+    angles looked for: a fixed point, begun without inertia. The reference's v is then M_pp^-1 pi, as the state's is.
+    On the lemniscate, with such rods in the plant, this lowers the error from 49 to 6.8 um in open loop, from 3.2 to
+    1.5 um with an input weight of 0.01 (horizon 10; at horizon 4 from 12 to 2.5 um), and not at 0.001 (2.1 to 2.6 um).
+
+    Parameters
+    ----------
+    scene : Scene
+    robot : Robot
+        As it is believed to be.
+    pose : Equilibrium
+        At the start; its branch is followed.
+    horizon : int
+        Periods beyond the end of the scene.
+    inertia : {"none", "constant", "condensed"}
+        Of the rods (see `Plant`).
 
     Raises
     ------
     PCRError
         The reference leaves the workspace; the message says when.
+    ConvergenceError
+        The inertia of the rods changes the angles too much for the fixed point.
     """
     assert scene.trajectory is not None
     t = scene.period * np.arange(scene.n_periods + horizon + 1)
-    samples = scene.trajectory(t)
-    states, forces = np.empty((len(t), 4 + robot.n_rods)), np.empty((len(t), 2))
-    eq = pose
+    p, v, a = np.moveaxis(scene.trajectory(t), 1, 0)
+    forces = -robot.tip_mass * a - robot.drag * v
+    q, levers = _angles(robot, pose, t, p, forces)
+    if inertia != "none":
+        plant = Plant(robot, inertia=inertia)
+        for _ in range(_MOST_SWEEPS):
+            plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
+            momentum, push, own = _momentum(plant, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
+            forces = push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
+            before, (q, levers) = q, _angles(robot, pose, t, p, forces)
+            change = float(np.abs(q - before).max())
+            if change < _SETTLED:
+                break
+        else:
+            raise ConvergenceError(
+                f"the inverse dynamics of {scene.name} with rods of inertia {inertia!r} did not settle: the motor "
+                f"angles still change by {change:.1e} rad in sweep {_MOST_SWEEPS}; take a slower reference or "
+                "inertia 'none'",
+                residual=change,
+                iterations=_MOST_SWEEPS,
+                last=q,
+            )
+        v = own
+    rates = np.diff(q, axis=0) / scene.period
+    return InverseDynamics(np.hstack([p, v, q]), rates, forces, angles_per_force=levers)
+
+
+def _angles(
+    robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motor angles at which the rods carry the forces at the tips p, (K, n) [rad], and their change by one more newton,
+    (K, n, 2) [rad/N]."""
+    angles, levers, eq = np.empty((len(t), robot.n_rods)), np.empty((len(t), robot.n_rods, 2)), pose
     for k in range(len(t)):
-        p, v, a = samples[k]
-        forces[k] = -robot.tip_mass * a - robot.drag * v
         try:
-            eq = inverse_statics(robot, p, forces[k], guess=eq)
+            eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
             raise type(error)(f"reference at t = {t[k]:.3f} s: {error}", **error.details) from None
-        states[k] = np.concatenate([p, v, eq.q])
-    return Reference(states, np.diff(states[:, 4:], axis=0) / scene.period, forces)
+        angles[k] = eq.q
+        levers[k] = np.linalg.pinv(eq.dforce_dq)
+    return angles, levers
+
+
+def _momentum(
+    plant: Plant, p: np.ndarray, v: np.ndarray, q: np.ndarray, rates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Momentum pi [N s], dT/dp [N] and M_pp^-1 pi [m/s] at K poses, shape (K, 2) each."""
+    n = 2 + plant.robot.n_rods
+    momentum, push, own = (np.empty_like(p) for _ in range(3))
+    for k in range(len(p)):
+        mass, slopes = plant.mass(p[k], q[k])
+        w = np.concatenate([v[k], rates[k]])
+        momentum[k] = mass[:2] @ w
+        push[k] = [w @ slopes[:, axis].reshape(n, n, order="F") @ w / 2 for axis in (0, 1)]
+        own[k] = np.linalg.solve(mass[:2, :2], momentum[k])
+    return momentum, push, own

@@ -84,6 +84,8 @@ class Scene:
         What the motors do until a late decision arrives: go on as before, or as the last plan foresaw.
     pose_limits : PoseLimits
         Torque, tip region and stability margins, which a controller keeps if it can.
+    own_period : float or None
+        Control period of the scene [s], where its tuning asks for another.
     """
 
     name: str
@@ -104,6 +106,7 @@ class Scene:
     deadline: float = math.inf
     late: str = LATE[0]
     pose_limits: PoseLimits = field(default_factory=PoseLimits)
+    own_period: float | None = None
 
     @property
     def n_periods(self) -> int:
@@ -118,7 +121,8 @@ class Scene:
         ModelError
             That period is not a multiple of the plant's step.
         """
-        period = tuning.period or self.period
+        own = self.own_period or self.period
+        period = tuning.period or own
         ratio = period / self.plant.dt
         if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio or self.duration < period:
             raise ModelError(
@@ -126,7 +130,7 @@ class Scene:
                 f"plant's step {self.plant.dt} s and at most the duration {self.duration} s",
                 key="period",
             )
-        return replace(self, tuning=tuning, period=period)
+        return replace(self, tuning=tuning, period=period, own_period=own if tuning.period else None)
 
     def start(self) -> Equilibrium:
         """Solve for the pose in which the robot starts, in balance without load.
@@ -209,8 +213,8 @@ def load_scene(path: str | Path) -> Scene:
             )
             if (plant.inertia == "full") != (plant.integrator == "gauss"):
                 raise table.fail("integrator", f"is {plant.integrator}: inertia 'full' needs 'gauss', and only it does")
-            if plant.inertia != "none" and plant.method != "closed_form":
-                raise table.fail("inertia", f"is {plant.inertia}, which needs method 'closed_form', not {plant.method}")
+            if plant.inertia != "none" and plant.method == "single_shooting":
+                raise table.fail("inertia", f"is {plant.inertia}, which method 'single_shooting' does not know")
         with file.table("control") as control:
             period = control.number("period", above=0.0)
             tuning = control.text("tuning", None)

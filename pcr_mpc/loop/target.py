@@ -13,6 +13,8 @@ from ..plant.robot import Robot
 
 _LARGEST_STEP = 0.1  # rad
 _ROUGH = 1e-2
+# Largest shift that is taken to first order: what is left out is of the order of its square, nanometres at the tip.
+_LINEAR = 1e-4  # rad
 _SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
 
 
@@ -36,6 +38,18 @@ class MotorTarget:
         """Begin at a pose on the branch of the reference, without a force."""
         self._plant.reset(np.concatenate([pose.p, [0.0, 0.0], pose.q]), pose)
         self._shift = np.zeros(len(pose.q))
+
+    def small_shift(self, angles_per_force: np.ndarray, force: np.ndarray) -> np.ndarray | None:
+        """Angles by which the rods carry ``force`` besides what they carry already; None if they are not small.
+
+        It takes no statics, and is what a controller meets whose model is right. ``angles_per_force``, shape (n, 2),
+        belongs to the pose (see `InverseDynamics`).
+        """
+        shift = angles_per_force @ force
+        if not max(map(abs, shift.tolist())) <= _LINEAR:
+            return None
+        self._shift = shift
+        return self._shift
 
     def shift(self, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Angles to add to q so that F = force at p; the last ones where the rods cannot follow."""

@@ -26,7 +26,7 @@ from ..plant.robot import Robot
 from ..plant.symbolic import rod_unknowns, symbolic_dynamics
 from .along_plan import AlongPlan
 from .controllers import Controller, Decision, HoldMotors
-from .feed_forward import feed_forward
+from .feed_forward import InverseDynamics, feed_forward
 from .scene import Scene
 from .target import MotorTarget
 
@@ -41,9 +41,14 @@ class TrackingController:
     tuning : Tuning
     robot : Robot, optional
         What the controller believes the robot to be; by default the scene's.
+    reference : InverseDynamics, optional
+        Inverse dynamics of the scene's reference for that robot, as `feed_forward` finds them, if they are known
+        already: most of what a start costs.
     """
 
-    def __init__(self, scene: Scene, tuning: Tuning, robot: Robot | None = None) -> None:
+    def __init__(
+        self, scene: Scene, tuning: Tuning, robot: Robot | None = None, reference: InverseDynamics | None = None
+    ) -> None:
         if scene.trajectory is None:
             raise ValueError(f"scene {scene.name} has no reference to track")
         self.name = tuning.name
@@ -51,6 +56,10 @@ class TrackingController:
         self.observer: DisturbanceObserver | None = None
         self._scene, self._tuning = scene, tuning
         self._delay = scene.delay if tuning.model.predict_delay else 0
+        self._known = reference
+        needed = scene.n_periods + tuning.horizon + self._delay
+        if reference is not None and len(reference.inputs) < needed:
+            raise ValueError(f"reference has {len(reference.inputs)} periods; scene and horizon need {needed}")
         self._model = self._make_model()
         self._along: AlongPlan | None = None
         if tuning.model.linearise == "along_plan":
@@ -64,8 +73,9 @@ class TrackingController:
         self._law: Law | None = None
 
     def start(self, pose: Equilibrium) -> None:
-        """See `Controller`; solves the inverse dynamics of the whole reference."""
-        self._reference = feed_forward(self._scene, self.robot, pose, self._tuning.horizon + self._delay)
+        """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
+        tail, inertia = self._tuning.horizon + self._delay, self._tuning.model.inertia
+        self._reference = self._known or feed_forward(self._scene, self.robot, pose, tail, inertia)
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         if self._law is None:
             self._law = self._make_law(pose)
@@ -155,10 +165,11 @@ class TrackingController:
         states, inputs = reference.states[k + 1 : k + 1 + horizon], reference.inputs[k : k + horizon]
         forces = reference.forces[k + 1 : k + 1 + horizon]
         if self.observer is not None:
-            end = states[-1]
+            end, lever = states[-1], self._reference.angles_per_force[k + horizon]
             forces = forces + force
+            shift = self._target.small_shift(lever, force)
             states = states.copy()
-            states[:, 4:] += self._target.shift(end[:2], end[4:], forces[-1])
+            states[:, 4:] += self._target.shift(end[:2], end[4:], forces[-1]) if shift is None else shift
         return Reference(states, inputs, forces)
 
     def _make_model(self) -> Plant:
@@ -188,7 +199,9 @@ def motor_limits(robot: Robot, period: float) -> Limits:
     return Limits(robot.rate_limit, robot.acceleration_limit * period, lower.copy(), upper.copy())
 
 
-def make_controller(scene: Scene, tuning: Tuning | None = None, robot: Robot | None = None) -> Controller:
+def make_controller(
+    scene: Scene, tuning: Tuning | None = None, robot: Robot | None = None, reference: InverseDynamics | None = None
+) -> Controller:
     """Build the controller of a scene: that of its tuning, or none where there is nothing to track.
 
     Parameters
@@ -197,8 +210,10 @@ def make_controller(scene: Scene, tuning: Tuning | None = None, robot: Robot | N
         Instead of the scene's own.
     robot : Robot, optional
         What the controller believes the robot to be.
+    reference : InverseDynamics, optional
+        Inverse dynamics that are known already (see `TrackingController`).
     """
     tuning = tuning or scene.tuning
     if scene.trajectory is None or tuning is None:
         return HoldMotors(scene.robot.n_rods)
-    return TrackingController(scene, tuning, robot)
+    return TrackingController(scene, tuning, robot, reference)
