@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from experiments.charts import statics
-from experiments.charts.motion import swing, yardstick
 from experiments.charts.points import about
+from experiments.charts.release import swing, yardstick
 from experiments.charts.statics import LITERAL_AT_ONCE
 from experiments.rod_inertia import STEP, furthest, start
 from pcr_mpc import Plant, Robot, linearise, load_robot, load_scene, load_tuning, make_controller, simulate
