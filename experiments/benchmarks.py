@@ -133,7 +133,7 @@ def show(found: list[Change], *, markdown: bool = False) -> str:
     """Table for the terminal or for CHANGELOG.md."""
 
     def number(value: float | None) -> str:
-        return "-" if value is None else f"{value:.3g}"
+        return "-" if value is None else f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
     if markdown:
         lines = [f"| {one.name} | {number(one.old)} | {number(one.new)} |" for one in found]
