@@ -75,7 +75,7 @@ def draw_control(rows: list[Row], path: Path) -> None:
         draw_points(panel, mine, CONTROL)
         draw_front(panel, mine, CONTROL.unit)
         panel.set(xscale="log", yscale="log", xlabel="wall time of a control step, p50 to p99 [ms]", title=case)
-        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5)))
         panel.yaxis.set_major_formatter("{x:g}")
         panel.yaxis.set_minor_formatter(NullFormatter())
     axes[0].set_ylabel("RMS tracking error after 1 s [mm]")
