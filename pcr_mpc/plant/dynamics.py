@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,22 +9,20 @@ import numpy as np
 from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
 from ..frozen import read_only
 from .equilibrium import Equilibrium
-from .inertia import INERTIAS
 from .integrators import INTEGRATORS
 from .mass_matrix import CondensedMass, MassMatrix, tip_mass
 from .modal_step import ModalStep
+from .plant_choices import ON_SNAP, checked_choices
 from .quick_step import QuickStep
 from .robot import Robot
 from .rod_solver import RodSolver, Snap
 from .rod_state import RobotState
-from .statics import checked_shooting, default_method, make_solver
+from .statics import checked_shooting, make_solver
 from .step_graph import LARGEST_DRIFT, PREDICTOR_ACCURACY, StepModel
-from .weight import WEIGHTS, CondensedWeight
+from .weight import CondensedWeight
 
-ON_SNAP = ("raise", "jump")
 # Residual of the statics at which derivatives may be taken for a linear model; their error is of this size.
 DERIVATIVE_ACCURACY = 1e-6
-_MOST_MODES = 64
 
 
 class Plant:
@@ -97,31 +94,7 @@ class Plant:
         on_snap: str = "raise",
         compiled: bool = False,
     ) -> None:
-        if on_snap not in ON_SNAP:
-            raise ValueError(f"on_snap is {on_snap!r}, expected one of {', '.join(ON_SNAP)}")
-        if inertia not in INERTIAS:
-            raise ValueError(f"inertia is {inertia!r}, expected one of {', '.join(INERTIAS)}")
-        if integrator not in (*INTEGRATORS, "gauss"):
-            raise ValueError(f"integrator is {integrator!r}, expected one of {', '.join(INTEGRATORS)}, gauss")
-        if (inertia == "full") != (integrator == "gauss"):
-            raise ValueError(f"inertia={inertia!r} does not go with integrator={integrator!r}: 'full' needs 'gauss'")
-        if weight is not None and weight not in WEIGHTS:
-            raise ValueError(f"weight is {weight!r}, expected one of {', '.join(WEIGHTS)}")
-        if weight is None:
-            heavy = any(robot.gravity) and any(rod.line_density for rod in robot.rods)
-            weight = "none" if not heavy else "condensed" if method == "closed_form" else "exact"
-        rods = robot if weight == "exact" else robot.weightless()
-        method = method or default_method(rods)
-        if weight == "condensed" and method != "closed_form":
-            raise ValueError(f"weight='condensed' needs method='closed_form', not {method!r}; take weight='exact'")
-        if weight == "condensed" and inertia == "full":
-            raise ValueError("inertia='full' does not condense the rods' weight; take weight='exact' or 'none'")
-        if inertia != "none" and method == "single_shooting":
-            raise ValueError(f"inertia={inertia!r} needs method='closed_form' or 'multiple_shooting', not {method!r}")
-        if not 0.0 < dt < np.inf:
-            raise ValueError(f"dt is {dt} s, expected a positive number")
-        if isinstance(modes, bool) or not isinstance(modes, int | np.integer) or not 4 <= modes <= _MOST_MODES:
-            raise ValueError(f"modes = {modes!r} must be a whole number from 4 to {_MOST_MODES}")
+        method, weight, rods = checked_choices(robot, method, inertia, modes, weight, integrator, dt, on_snap)
         self.robot = robot
         self.method = method
         self.inertia = inertia
@@ -318,19 +291,7 @@ class Plant:
         x = checked_vector("x", x, self.n_states)
         self._go(x[:2], x[4:], None)
         eq = self._solver.equilibrium(x[:2], x[4:])
-        if self._sag is None:
-            return eq
-        energy, slope = self._sag.first(self._unknowns(), x[4:])
-        curvature = self._sag.second(self._unknowns(), x[4:])
-        return replace(
-            eq,
-            force=eq.force + slope[:2],
-            dforce_dp=eq.dforce_dp + curvature[:2, :2],
-            dforce_dq=eq.dforce_dq + curvature[:2, 2:],
-            motor_torque=eq.motor_torque + slope[2:],
-            dtorque_dq=eq.dtorque_dq + np.diag(curvature)[2:],
-            energy=eq.energy + energy,
-        )
+        return eq if self._sag is None else self._sag.added(eq, self._unknowns())
 
     def _unknowns(self) -> np.ndarray:
         assert isinstance(self._solver, RodSolver)
