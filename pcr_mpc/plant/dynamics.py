@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
+from ..errors import ConvergenceError, PCRError, UnstableError, checked_number, checked_vector
 from ..frozen import read_only
 from .equilibrium import Equilibrium
 from .integrators import INTEGRATORS
@@ -66,7 +67,8 @@ class Plant:
     -----
     A state does not say on which branch the rods are, so the plant follows them by continuity from one call
     to the next; `reset` starts elsewhere. Motors saturate: rates are clipped to the limit and angles stop at
-    theirs. (The limit on the change of rate concerns commands, and is the controller's.)
+    theirs. (The limit on the change of rate concerns commands, and is the controller's.) What the tip carries besides
+    its own mass is the plant's ``payload`` [kg], see `carry`.
 
     A motor's rate jumps from one step to the next, and a rod's mass makes that an impulse on the tip: the momentum
     M_pp p' + M_pq u has no jump, p' has one. The state's v is therefore M_pp^-1 times the momentum: the velocity
@@ -112,6 +114,8 @@ class Plant:
         self._accuracy = 0.0  # of the derivatives there
         self._mass = tip_mass(robot)
         self._mass_at: list[float] | None = None
+        self.payload = 0.0
+        self._tip_weight = robot.tip_weight
         self._condensed: CondensedMass | None = None
         self.step_model: StepModel | None = None
         if isinstance(self._solver, RodSolver):
@@ -131,6 +135,7 @@ class Plant:
         self._at = None
         if self._quick is not None:
             self._quick.hand_over()
+        self._take(0.0)
         if guess is None:
             self._solver.start(p, q)
         else:
@@ -142,10 +147,57 @@ class Plant:
             assert self._condensed is not None
             self._mass = self._condensed(self._unknowns(), q)[0], self._mass[1]
 
+    def carry(self, payload: float, x: Any) -> np.ndarray:
+        """Let the tip carry a payload besides its own mass from state x on; a `reset` takes it away.
+
+        What is picked up was at rest: the momentum stays, and the tip becomes slower. What is put down leaves with the
+        velocity of the tip, which stays.
+
+        Parameters
+        ----------
+        payload : float
+            All that is carried from now on [kg]; it has weight where there is gravity.
+        x : array_like, shape (4 + n,)
+            State [m, m/s, rad].
+
+        Returns
+        -------
+        ndarray, shape (4 + n,)
+            State just after.
+        """
+        payload = checked_number("payload", payload, minimum=0.0)
+        after = checked_vector("x", x, self.n_states).copy()
+        p, v, q = after[:2], after[2:4], after[4:]
+        picked_up, momentum = payload - self.payload, self.mass(p, q)[0][:2, :2] @ v
+        self._take(payload)
+        if picked_up <= 0.0:
+            return after
+        if self._modal is not None and (vibrating := self._modal.pick_up(self, picked_up, after)) is not None:
+            return vibrating
+        v[:] = np.linalg.solve(self.mass(p, q)[0][:2, :2], momentum)
+        return after
+
+    def _take(self, payload: float) -> None:
+        if payload == self.payload:
+            return
+        mass, slopes = self._mass
+        n = self.robot.n_rods
+        self._mass = read_only(mass + np.diag([payload - self.payload] * 2 + [0.0] * n)), slopes
+        self.payload, self._mass_at = payload, None
+        self._tip_weight = self.robot.tip_weight + payload * np.array(self.robot.gravity)
+        if self.step_model is not None:
+            if self._quick is not None:
+                self._quick.hand_over()
+                self._quick = self._quick_at = None  # its graph has the mass of the tip
+            loaded = replace(self.robot, tip_mass=self.robot.tip_mass + payload)
+            self.step_model = replace(self.step_model, robot=loaded)
+        if self._modal is not None:
+            self._modal.rods.tip_mass = self.robot.tip_mass + payload
+
     @property
     def tip_weight(self) -> np.ndarray:
-        """m g, shape (2,) [N]."""
-        return self.robot.tip_weight
+        """Of tip mass and payload, shape (2,) [N]."""
+        return self._tip_weight
 
     @property
     def snaps(self) -> list[Snap]:
@@ -277,7 +329,7 @@ class Plant:
         force = self.force(p, q)
         if self._mass_moves and self._mass_at is not self._at:
             assert self._condensed is not None
-            self._mass, self._mass_at = self._condensed(self._unknowns(), q), self._at
+            self._mass, self._mass_at = self._condensed(self._unknowns(), q, self.payload), self._at
         return force, self._mass
 
     def tip_velocity(self, x: Any, u: Any) -> np.ndarray:
