@@ -184,6 +184,31 @@ def test_heavy_rods_that_sag(heavy, sagging, u):
     assert errors["none"] > 5.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("model", "gravity", "none", "constant", "condensed"),
+    [
+        ("heavy_pair", -9.81, 20.0, 2.5, 0.1),
+        ("planar_pair", -9.81, 2.0, 0.4, 0.002),
+        ("curved_pair", 0.0, 2.0, 0.4, 0.002),
+    ],
+)
+def test_a_second_of_free_motion_of_rods_as_built(model, gravity, none, constant, condensed):
+    """Let go 30 mm to the right of the balance and 20 mm above it; errors in mm: at least, at most, at most."""
+    robot = replace(load_robot(MODELS / f"{model}.toml"), gravity=(0.0, gravity))
+    rest = inverse_statics(robot, (0.0, 0.25), mode="LR")
+    pose = solve_statics(robot, rest.p + [0.03, 0.02], rest.q, guess=rest)
+    reference, fewer = (released(robot, pose, (0.0, 0.0), seconds=1.0, modes=modes) for modes in (14, 10))
+    assert distance(fewer, reference) < 1e-4
+    errors = {
+        inertia: distance(released(robot, pose, (0.0, 0.0), seconds=1.0, inertia=inertia, integrator="rk4"), reference)
+        for inertia in ("none", "constant", "condensed")
+    }
+    assert errors["none"] > none
+    assert errors["constant"] < constant
+    assert errors["condensed"] < condensed
+
+
 @pytest.mark.parametrize("u", [(0.0, 0.0), (1.0, -0.5)])
 def test_the_condensed_inertia_is_its_limit(pair, centre, u):
     """With lighter rods the condensed error vanishes as the square of their mass, that of none as the mass.

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -91,6 +92,19 @@ def test_a_wrong_file_is_named_with_its_key(files, file, old, new, key, message)
         load_scene(files / "models/scenes/lemniscate.toml")
     assert caught.value.key == key
     assert str(path) in str(caught.value)
+
+
+def test_a_tuning_without_a_period_has_the_scenes(files):
+    """Not that of the tuning before."""
+    path = files / "controllers/frozen.toml"
+    path.write_text(path.read_text().replace('name = "frozen"', 'name = "frozen"\nperiod = 0.005'))
+    scene = files / "models/scenes/lemniscate.toml"
+    scene.write_text(re.sub(r"controllers/\w+\.toml", "controllers/frozen.toml", scene.read_text()))
+    scene = load_scene(scene)
+    default = load_tuning(files / "controllers/default.toml")
+    assert scene.period == scene.tuned(replace(default, period=0.005)).period == 0.005
+    assert scene.tuned(default).period == 0.01
+    assert scene.tuned(default).tuned(scene.tuning) == scene
 
 
 def test_broken_and_missing_files(tmp_path):

@@ -1,9 +1,13 @@
 """The search for a tuning: scored against the start, shared, resumable, and believed on other episodes only."""
 
 import json
+import random
+import re
 import shutil
 import sys
+import threading
 import tomllib
+from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +16,7 @@ import pytest
 from pcr_mpc import PCRError, load_scene, load_tuning
 from pcr_mpc.cli import main
 from pcr_mpc.errors import StudyError
-from pcr_mpc.loop import tuning_study
+from pcr_mpc.loop import tuning_score, tuning_space, tuning_study
 from pcr_mpc.loop.episodes import EXACT, Spread
 from pcr_mpc.loop.tuning_file import default_path, write_tuning
 from pcr_mpc.loop.tuning_score import Costs, measure, score
@@ -26,6 +30,15 @@ pytest.importorskip("optuna")
 START = Costs(10.0, 0.04, 100.0, 250.0, 1.0, 0.25, 0.0)
 
 
+class Shuffled(Here):
+    """Results are ready when they like."""
+
+    def submit(self, task, /, *arguments, **keywords):
+        done, late = super().submit(task, *arguments, **keywords), Future()
+        threading.Timer(random.uniform(0.0, 0.02), lambda: late.set_result(done.result())).start()
+        return late
+
+
 @pytest.fixture(scope="module")
 def scene():
     return replace(load_scene(MODELS / "scenes" / "lemniscate.toml"), duration=0.1)
@@ -33,7 +46,7 @@ def scene():
 
 @pytest.fixture
 def search(scene, tmp_path):
-    return tuning_study.Search(scene, Spread(), 2, 0, f"sqlite:///{tmp_path / 'study.db'}")
+    return tuning_space.Search(scene, Spread(), 2, 0, f"sqlite:///{tmp_path / 'study.db'}")
 
 
 @pytest.fixture
@@ -70,6 +83,23 @@ def test_no_tracking_makes_up_for_failures_and_no_nanometres_for_tracking():
     assert score(lost, lost) == 1.0
 
 
+def test_a_step_that_fits_ten_times_into_its_period_is_fast_enough(scene, monkeypatch):
+    """Below that the clock's noise would decide between tunings; above, the share of the period counts."""
+    start, times = scene.tuning, {}
+
+    def timed(scene, tuning, seed, spread):
+        row = dict.fromkeys(("rms_mm", "effort_rad_s2"), 1.0)
+        return {**row, "failure": "", "timing": {"control_cpu_us": times[tuning.horizon, tuning.period], "late": 0.0}}
+
+    monkeypatch.setattr(tuning_score, "run_episode", timed)
+    times |= {(10, None): 400.0, (5, None): 900.0, (20, None): 2000.0, (10, 0.005): 2000.0}
+    relative = [
+        measure(scene, start, replace(start, horizon=horizon, period=period), [0], EXACT).step_time
+        for horizon, period in times
+    ]
+    assert relative == pytest.approx([1.0, 1.0, 2.0, 4.0])
+
+
 def test_costs_are_those_of_the_episodes(scene):
     start = scene.tuning
     other = replace(start, input_weight=0.1)
@@ -104,6 +134,57 @@ def test_the_first_trial_is_the_start_and_a_second_call_adds(search, counted):
     tuning_study.tune(search, 3, Here(), progress=False)
     assert len(tuning_study.finished_trials(search)) == 16
     assert len([call for call in counted[before:] if call[1] == (0, 1)]) == 3
+
+
+def test_guesses_come_first_and_the_known_tuning_before_them(search, counted):
+    """Those of an expert, as far as the scene has room for them, and none twice."""
+    known = replace(search.start, name="lemniscate", horizon=7, velocity_weight=2.5)
+    search = replace(search, known=known)
+    guesses = tuning_space.guesses(search)
+    assert len(guesses) == 1 + len(tuning_space.GUESSES)
+    tuning_study.tune(search, len(guesses) + 2, Here(), progress=False)
+    tried = [tuning for tuning, seeds in counted if seeds == (0, 1)]
+    assert tried[0] == search.start
+    assert tried[1] == replace(known, name=search.start.name)
+    assert tried[1 : 1 + len(guesses)] == [tuning_space.candidate(search, guess) for guess in guesses]
+    robust = load_tuning(CONTROLLERS / "robust.toml")
+    assert replace(robust, name=search.start.name) in tried
+    assert len(set(tried)) == len(guesses) + 3
+
+
+def test_guesses_that_the_scene_has_no_room_for_are_left_out(search):
+    late = replace(search, scene=replace(search.scene, delay=2))
+    assert 0 < len(tuning_space.guesses(late)) < len(tuning_space.GUESSES)
+    blind = replace(search, scene=replace(search.scene, tuning=replace(search.start, observer=None)))
+    for one in (late, blind):
+        names = set(tuning_space.space(one))
+        assert all(set(guess) == names for guess in tuning_space.guesses(one))
+    far = replace(search, known=replace(search.start, horizon=99))
+    assert tuning_space.guesses(far) == tuning_space.guesses(search)
+
+
+def test_trials_do_not_depend_on_who_runs_them(search, counted, tmp_path):
+    """In turn, or by threads that finish as they like: the same trials, after the guesses, too."""
+    again = replace(search, storage=f"sqlite:///{tmp_path / 'again.db'}")
+    tuning_study.tune(search, 20, Here(), progress=False)
+    with Shuffled() as executor:
+        tuning_study.tune(again, 20, executor, progress=False)
+    assert tuning_study.finished_trials(again) == tuning_study.finished_trials(search)
+
+
+def test_a_trial_without_a_result_is_named_and_the_others_are_kept(search, counted, monkeypatch):
+    formula = tuning_study.measure
+
+    def failing(*arguments, **keywords):
+        if len(counted) == 3:
+            counted.append(None)
+            raise ArithmeticError("lost")
+        return formula(*arguments, **keywords)
+
+    monkeypatch.setattr(tuning_study, "measure", failing)
+    with pytest.raises(StudyError, match=r"1 of 6 trials ended without a result.*trial 3: ArithmeticError: lost"):
+        tuning_study.tune(search, 6, Here(), progress=False)
+    assert [row["trial"] for row in tuning_study.finished_trials(search)] == [0, 1, 2, 4, 5, 6]
 
 
 def test_what_does_not_last_on_other_episodes_is_not_chosen(search, counted, monkeypatch):
@@ -235,6 +316,31 @@ def test_tune_writes_a_tuning_that_beats_its_start(tmp_path, monkeypatch, capsys
         assert words in text
     assert (tmp_path / "results/tune/pick_and_place/trade_off.png").stat().st_size > 10_000
     assert len((tmp_path / "results/tune/pick_and_place/trials.csv").read_text().splitlines()) == 8
+
+
+def test_a_scene_that_was_tuned_is_tuned_from_the_default_again(tmp_path, monkeypatch):
+    """What was found before is tried first, but what is to be beaten is the same as then."""
+    for folder in (MODELS, CONTROLLERS):
+        shutil.copytree(folder, tmp_path / folder.name)
+    scene = tmp_path / "models/scenes/hold_with_load.toml"
+    scene.write_text(re.sub(r"controllers/\w+\.toml", "controllers/hold_with_load.toml", scene.read_text()))
+    default = load_tuning(CONTROLLERS / "default.toml")
+    known = replace(default, name="hold_with_load", period=0.005, horizon=14)
+    write_tuning(known, tmp_path / "controllers/hold_with_load.toml", [])
+    monkeypatch.chdir(tmp_path)
+    searches = []
+
+    def stopped(search, *_):
+        searches.append(search)
+        raise PCRError("enough")
+
+    monkeypatch.setattr("pcr_mpc.cli.tune", stopped)
+    assert main(["tune", str(scene)]) == 1
+    assert main(["tune", str(scene), "--start", str(CONTROLLERS / "slow_motors.toml")]) == 1
+    assert main(["tune", str(MODELS / "scenes/limited.toml"), "--start", str(CONTROLLERS / "default.toml")]) == 1
+    assert [search.start for search in searches] == [default, load_tuning(CONTROLLERS / "slow_motors.toml"), default]
+    assert [search.scene.period for search in searches] == [0.01] * 3
+    assert [search.known for search in searches[:2]] == [known] * 2
 
 
 def test_tune_without_success_writes_nothing(tmp_path, monkeypatch, capsys):

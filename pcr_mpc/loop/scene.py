@@ -71,6 +71,8 @@ class Scene:
         What is asked of the simulation.
     finding : Finding or None
         What is known of the plant's rung.
+    own_period : float or None
+        Control period of the scene [s], where its tuning asks for another.
     """
 
     name: str
@@ -94,6 +96,7 @@ class Scene:
     payload: Payload | None = None
     need: Need | None = None
     finding: Finding | None = None
+    own_period: float | None = None
 
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Payload at the times t [s], same shape [kg]."""
@@ -112,7 +115,8 @@ class Scene:
         ModelError
             That period is not a multiple of the plant's step.
         """
-        period = tuning.period or self.period
+        own = self.own_period or self.period
+        period = tuning.period or own
         ratio = period / self.plant.dt
         if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio or self.duration < period:
             raise ModelError(
@@ -120,7 +124,7 @@ class Scene:
                 f"plant's step {self.plant.dt} s and at most the duration {self.duration} s",
                 key="period",
             )
-        return replace(self, tuning=tuning, period=period)
+        return replace(self, tuning=tuning, period=period, own_period=own if tuning.period else None)
 
     def start(self) -> Equilibrium:
         """Solve for the pose in which the robot starts, in balance without load.

@@ -9,12 +9,25 @@ from pathlib import Path
 
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, StudyError
+from .scene import Scene, load_scene
 
 
 def default_path(scene_file: Path, name: str) -> Path:
     """Where the tuning of a scene belongs: beside the one that its file names."""
     own = tomllib.loads(scene_file.read_text(encoding="utf-8"))["control"]["tuning"]
     return Path(os.path.normpath(scene_file.parent / own)).with_name(f"{name}.toml")
+
+
+def to_tune(scene_file: Path, start: Path | None = None) -> tuple[Scene, Tuning | None]:
+    """Scene with the tuning that a search is to beat, and what an earlier search has found for it.
+
+    By default that is the scene's own tuning. One that bears the scene's name is from an earlier search: then it is
+    default.toml beside it, as it was for that search, and what was found is there to be found again.
+    """
+    scene, known = load_scene(scene_file), None
+    if scene.tuning is not None and scene.tuning.name == scene.name:
+        known, start = scene.tuning, start or default_path(scene_file, "default")
+    return (scene.tuned(load_tuning(start)) if start else scene), known
 
 
 def write_tuning(tuning: Tuning, path: Path, comments: Sequence[str]) -> None:

@@ -2,84 +2,31 @@
 
 from __future__ import annotations
 
-import math
-import platform
 import warnings
-import zlib
-from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from collections import deque
+from concurrent.futures import BrokenExecutor, Executor, Future
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from tqdm import tqdm
 
-from ..control.tuning import LINEARISE, Tuning
+from ..control.tuning import Tuning
 from ..errors import PCRError, StudyError
-from .episodes import Spread
 from .parallel import finished
 from .provenance import described, differences
-from .scene import Scene
 from .tuning_score import Costs, measure, score
+from .tuning_space import Search, candidate, guesses, parameters, space
 
 if TYPE_CHECKING:
-    from optuna import Study
-    from optuna.distributions import BaseDistribution
+    from optuna import Study, Trial
 
-HORIZONS = (4, 30)
-PERIODS = (0.005, 0.01, 0.02)  # s
-# Ranges of what is searched on a logarithmic scale; units as in `Tuning` and `ObserverTuning`.
-RANGES = {
-    "input_weight": (1e-5, 1e1),
-    "velocity_weight": (1e-1, 1e3),
-    "force_noise": (1e-4, 1.0),
-    "force_walk": (1e-5, 1e-1),
-}
 _WAIT_FOR_SQLITE = 60.0  # s, while another process writes
+# Trials that may run at once. A trial is chosen knowing all but the last so many: more would teach it less.
+_AHEAD = 8
 # The best few in the search are run once more on other episodes: the best of many is partly lucky.
 _CONFIRMED = 3
-
-
-@dataclass(frozen=True)
-class Search:
-    """What is searched: all trials of a study share it.
-
-    Attributes
-    ----------
-    scene : Scene
-        Its tuning is the start.
-    spread : Spread
-    episodes : int
-        With mismatch, for each trial; the same for all.
-    seed : int
-        Of the first episode.
-    storage : str
-        URL of Optuna's storage.
-    """
-
-    scene: Scene
-    spread: Spread
-    episodes: int
-    seed: int
-    storage: str
-
-    @property
-    def start(self) -> Tuning:
-        """Tuning to improve."""
-        tuning = self.scene.tuning
-        if tuning is None or tuning.law != "linear_mpc":
-            law = "nothing to track" if tuning is None else f"law {tuning.law!r}"
-            raise ValueError(f"scene {self.scene.name} has {law}; what is tuned is the law 'linear_mpc'")
-        return tuning
-
-    @property
-    def seeds(self) -> range:
-        """Of the episodes of a trial."""
-        return range(self.seed, self.seed + self.episodes)
-
-    @property
-    def other_seeds(self) -> range:
-        """Of twice as many episodes that no trial has seen."""
-        return range(self.seed + self.episodes, self.seed + 3 * self.episodes)
 
 
 @dataclass(frozen=True)
@@ -112,7 +59,7 @@ def tune(search: Search, trials: int, executor: Executor, *, progress: bool = Tr
     search : Search
     trials : int
     executor : Executor
-        Runs them; its processes need to reach the storage.
+        Measures them; this process alone speaks with the storage.
     progress : bool
         Show a progress bar on stderr.
 
@@ -126,11 +73,8 @@ def tune(search: Search, trials: int, executor: Executor, *, progress: bool = Tr
         Says how to go on.
     """
     study = _prepare(search, executor, progress)
-    begun = len(study.trials)
     try:
-        for _ in finished(executor, partial(_run_trial, search), range(begun, begun + trials),
-                          desc=f"tune {search.scene.name}", unit="trial", progress=progress):  # fmt: skip
-            pass  # the storage has it
+        _run(study, search, trials, executor, progress)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted; {len(finished_trials(search))} trials are kept in {search.storage}, "
@@ -144,67 +88,6 @@ def finished_trials(search: Search) -> list[dict[str, Any]]:
     optuna = _optuna()
     trials = _study(search.storage, search.scene.name).get_trials(states=(optuna.trial.TrialState.COMPLETE,))
     return [{"trial": t.number, "score": t.value, **t.user_attrs["costs"], **t.params} for t in trials]
-
-
-def candidate(search: Search, params: dict[str, Any]) -> Tuning:
-    """Tuning of a trial: the start with its parameters, numbers to three digits, as they are written to a file."""
-    start, own = search.start, search.scene.period
-    short = {name: float(f"{value:.3g}") for name, value in params.items() if name in RANGES}
-    period = params.get("period", own)
-    observer = start.observer
-    if observer is not None:
-        observer = replace(observer, force_noise=short["force_noise"], force_walk=short["force_walk"])
-    return replace(
-        start,
-        horizon=params["horizon"],
-        input_weight=short["input_weight"],
-        velocity_weight=short["velocity_weight"] if params["weigh_velocity"] else 0.0,
-        period=start.period if period == own else period,
-        model=replace(start.model, linearise=params["linearise"]),
-        observer=observer,
-    )
-
-
-def _start_params(search: Search) -> dict[str, Any]:
-    start = search.start
-    params: dict[str, Any] = {
-        "horizon": start.horizon,
-        "input_weight": start.input_weight,
-        "weigh_velocity": start.velocity_weight > 0,
-        "velocity_weight": start.velocity_weight or RANGES["velocity_weight"][0],
-        "linearise": start.model.linearise,
-    }
-    if start.observer is not None:
-        params |= {"force_noise": start.observer.force_noise, "force_walk": start.observer.force_walk}
-    if len(_periods(search.scene)) > 1:
-        params["period"] = search.scene.period
-    return params
-
-
-def _periods(scene: Scene) -> list[float]:
-    """Control periods that the plant's step divides; a known delay and a deadline are those of one period only."""
-    if scene.delay or math.isfinite(scene.deadline):
-        return [scene.period]
-    ratios = {period: period / scene.plant.dt for period in {*PERIODS, scene.period}}
-    fitting = [period for period, r in ratios.items() if r > 0.5 and abs(r - round(r)) <= 1e-9 * r]
-    return sorted(period for period in fitting if scene.duration >= period)
-
-
-def _space(search: Search) -> dict[str, BaseDistribution]:
-    """Distribution of each parameter, wide enough for the start."""
-    distributions = _optuna().distributions
-    space: dict[str, BaseDistribution] = {}
-    for name, value in _start_params(search).items():
-        if name in RANGES:
-            low, high = RANGES[name]
-            space[name] = distributions.FloatDistribution(min(low, value), max(high, value), log=True)
-        elif name == "horizon":
-            low, high = HORIZONS
-            space[name] = distributions.IntDistribution(min(low, value), max(high, value))
-        else:
-            choices = {"weigh_velocity": (False, True), "linearise": LINEARISE, "period": _periods(search.scene)}
-            space[name] = distributions.CategoricalDistribution(choices[name])
-    return space
 
 
 def _prepare(search: Search, executor: Executor, progress: bool) -> Study:
@@ -227,34 +110,76 @@ def _prepare(search: Search, executor: Executor, progress: bool) -> Study:
         task = partial(measure, search.scene, start, seeds=search.seeds, spread=search.spread)
         ((_, costs),) = finished(executor, task, [start], desc=start.name, unit="tuning", progress=progress)
         trial = optuna.trial.create_trial(
-            params=_start_params(search),
-            distributions=_space(search),
+            params=parameters(search, start),
+            distributions=space(search),
             value=score(costs, costs),
             user_attrs={"costs": costs.row()},
         )
         study.add_trial(trial)
+        for guess in guesses(search):
+            study.enqueue_trial(guess)
     return study
 
 
-def _run_trial(search: Search, number: int) -> None:
-    """Run one more trial; ``number`` decides which one, as far as the trials before it do not."""
+def _run(study: Study, search: Search, trials: int, executor: Executor, progress: bool) -> None:
+    """Run more trials. Asked and told in turn, they do not depend on how many processes there are, nor on the clock."""
+    task = partial(measure, search.scene, search.start, seeds=search.seeds, spread=search.spread)
+    start = Costs(**study.get_trials(deepcopy=False)[0].user_attrs["costs"])
+    pending: deque[tuple[Trial, Future[Costs]]] = deque()
+    lost: list[tuple[int, Exception]] = []
+
+    def ask() -> None:
+        trial = _ask(study, search)
+        try:
+            pending.append((trial, executor.submit(task, candidate(search, trial.params))))
+        except BaseException:
+            study.tell(trial, state=_optuna().trial.TrialState.FAIL)
+            raise
+
+    def tell(trial: Trial, future: Future[Costs]) -> None:
+        try:
+            costs = future.result()
+        except Exception as error:
+            lost.append((trial.number, error))
+            study.tell(trial, state=_optuna().trial.TrialState.FAIL)
+            return
+        trial.set_user_attr("costs", costs.row())
+        study.tell(trial, score(costs, start))
+
+    bar = tqdm(range(trials), desc=f"tune {search.scene.name}", unit="trial", disable=not progress)
+    try:
+        for number in bar:
+            while len(pending) < min(_AHEAD, trials - number):
+                ask()
+            pending[0][1].exception()  # wait while it is still on the list
+            tell(*pending.popleft())
+    except BrokenExecutor as error:
+        lost.append((len(study.trials) - 1, error))
+    finally:
+        for trial, future in pending:
+            if future.done():
+                tell(trial, future)
+            else:
+                future.cancel()
+                study.tell(trial, state=_optuna().trial.TrialState.FAIL)
+    if lost:
+        first, cause = lost[0]
+        raise StudyError(
+            f"{len(lost)} of {trials} trials ended without a result, the others are kept in {search.storage}; the "
+            f"first, trial {first}: {type(cause).__name__}: {cause}",
+            lost=[number for number, _ in lost],
+        ) from cause
+
+
+def _ask(study: Study, search: Search) -> Trial:
+    """Next trial: a guess that is left, or what the sampler makes of the trials that were told and are running."""
     optuna = _optuna()
-    study = _study(search.storage, search.scene.name)
-    # Machines that share a study are not to begin with the same guesses.
-    seed = np.random.SeedSequence([search.seed, number, zlib.crc32(platform.node().encode())]).generate_state(1)
+    seed = np.random.SeedSequence([search.seed, len(study.trials)]).generate_state(1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        # Its trials that still run count as bad ones: workers do not crowd where one is already.
+        # Its trials that still run count as bad ones: it does not crowd where one is already.
         study.sampler = optuna.samplers.TPESampler(seed=int(seed[0]), constant_liar=True)
-    trial = study.ask(_space(search))
-    try:
-        tuning = candidate(search, trial.params)
-        costs = measure(search.scene, search.start, tuning, search.seeds, search.spread)
-        trial.set_user_attr("costs", costs.row())
-        study.tell(trial, score(costs, Costs(**study.get_trials()[0].user_attrs["costs"])))
-    except BaseException:
-        study.tell(trial, state=optuna.trial.TrialState.FAIL)
-        raise
+    return study.ask(space(search))
 
 
 def _confirm(search: Search, executor: Executor, progress: bool) -> Chosen | None:

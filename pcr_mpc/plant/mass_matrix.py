@@ -35,7 +35,7 @@ class CondensedMass:
     """
 
     def __init__(self, robot: Robot, method: RodMethod) -> None:
-        self._graph = BufferedFunction(_robot_mass(robot, method))
+        self._graph = BufferedFunction(robot_mass(robot, method))
 
     def __call__(self, unknowns: np.ndarray, q: np.ndarray, payload: float = 0.0) -> MassMatrix:
         """M and its slopes for w = [v, q'], in equilibrium, with what the tip carries [kg].
@@ -63,8 +63,15 @@ class CondensedMass:
 
 
 @lru_cache(maxsize=16)
-def _robot_mass(robot: Robot, method: RodMethod) -> Any:
-    """Graph (unknowns (u, n), q (n)) -> M in [kg, kg m, kg m^2], d vec(M) / d(p, q)."""
+def robot_mass(robot: Robot, method: RodMethod) -> Any:
+    """Graph of the mass matrix.
+
+    Returns
+    -------
+    casadi.Function
+        (unknowns (u, n), q (n)) -> M (2 + n, 2 + n) in [kg, kg m, kg m^2] for w = [v, q'], and d vec(M) / d(p, q),
+        shape ((2 + n)^2, 2 + n).
+    """
     n, of_rod = robot.n_rods, method.mass()
     unknowns, q = ca.MX.sym("unknowns", of_rod.size1_in(0), n), ca.MX.sym("q", n)
     mass, slopes = ca.MX(2 + n, 2 + n), ca.MX((2 + n) ** 2, 2 + n)

@@ -50,6 +50,8 @@ class RodMethod:
         See `multiple_shooting.rod_newton`.
     retract : casadi.Function
         (unknowns, change) -> unknowns: how a step is taken.
+    chord : casadi.Function or None
+        (unknowns, pose, tangent) -> change: a cheap iteration with derivatives that are there, if there is one.
     tolerance : float
         Residual at which a rod counts as solved: rounding.
     following : float
@@ -72,6 +74,7 @@ class RodMethod:
     newton: Any
     residual: Any
     retract: Any
+    chord: Any
     tolerance: float
     following: float
     branch: slice
@@ -104,6 +107,7 @@ def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
         newton=newton,
         residual=residual,
         retract=ca.Function("retraction", [start, change], [start + change]),
+        chord=None,
         # Relative to the load; on taut rods the equations have a condition of 1e8.
         tolerance=1e-10,
         following=1e-10,
@@ -125,6 +129,7 @@ def closed_form_method() -> RodMethod:
         newton=newton,
         residual=residual,
         retract=elastica.retraction(),
+        chord=elastica.rod_chord(),
         tolerance=1e-13,
         following=1e-11,
         branch=slice(0, 3),
@@ -139,7 +144,9 @@ def closed_form_method() -> RodMethod:
 def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     """Tangent predictor, a fixed number of Newton iterations and the verdict, for the whole robot in one graph.
 
-    Nothing is decided in here: the caller reads the verdict, and keeps the result or takes the slow way.
+    Nothing is decided in here: the caller reads the verdict, and keeps the result or takes the slow way. After a
+    single iteration comes one with the same derivatives, where the method has that: without it, every other step of a
+    brisk motion misses the tolerance by a digit, and costs a second iteration.
 
     Returns
     -------
@@ -171,6 +178,8 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
         for _ in range(iterations):
             step, tangent, _, load_tangent, scalars = method.newton(u, pose, *known)
             u = method.retract(u, step)
+        if iterations == 1 and method.chord is not None:
+            u = method.retract(u, method.chord(u, pose, tangent))
         residual, loads = method.residual(u, pose, *known)
         for name, value in zip(columns, (u, tangent, pose, loads, load_tangent, scalars), strict=True):
             columns[name].append(value)
@@ -193,5 +202,5 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
 
 def inlined(function: Any, of_rod: Any) -> Any:
     """Inline the graph of a rod into that of a robot that calls it, if it is small."""
-    small = of_rod.n_instructions() <= _INLINED_INSTRUCTIONS
+    small = of_rod.is_a("SXFunction") and of_rod.n_instructions() <= _INLINED_INSTRUCTIONS
     return function.expand(function.name(), {"cse": True}) if small else function

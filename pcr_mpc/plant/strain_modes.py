@@ -190,7 +190,7 @@ class StrainModes:
     def fitted(self, nodes: np.ndarray) -> np.ndarray:
         """Modes near rods given by their nodes (n, 4, any), see `Equilibrium.nodes`; shape (n, N)."""
         s = np.linspace(0.0, 1.0, _SAMPLES)
-        physics = self._physics or [None] * len(nodes)
+        physics = self._physics or (None,) * len(nodes)
         moments = np.stack([sample_rod(rod, _SAMPLES, its)[5] for rod, its in zip(nodes, physics, strict=True)])
         fit = np.linalg.lstsq(legvander(2 * s - 1, self.modes - 1), moments.T, rcond=None)[0]
         return np.ascontiguousarray(fit.T)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ..loop.tuning_study import Chosen, Search
+from ..loop.tuning_space import Search
+from ..loop.tuning_study import Chosen
 from ..plant.equilibrium import Equilibrium
 from ..plant.stability import assess_stability
 
