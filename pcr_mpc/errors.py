@@ -67,12 +67,12 @@ class SimulationError(PCRError):
     """A closed-loop run ended early; ``run`` holds everything until then."""
 
 
-class NoRungError(PCRError):
-    """No rung of the ladder of physics meets a scene's ``need``: ``best_error`` [m], and why each was ``rejected``."""
-
-
 class CompilerError(PCRError):
     """No machine code could be made of a graph; ``command`` is what was run."""
+
+
+class NoRungError(PCRError):
+    """No rung of the ladder of physics meets a scene's ``need``: ``best_error`` [m], and why each was ``rejected``."""
 
 
 class StudyError(PCRError):

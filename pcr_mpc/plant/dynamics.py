@@ -112,8 +112,9 @@ class Plant:
         self._at: list[float] | None = None
         self._accuracy = 0.0  # of the derivatives there
         self._mass = tip_mass(robot)
-        self.payload = 0.0
         self._mass_at: list[float] | None = None
+        self.payload = 0.0
+        self._tip_weight = robot.tip_weight
         self._condensed: CondensedMass | None = None
         self.step_model: StepModel | None = None
         if isinstance(self._solver, RodSolver):
@@ -131,9 +132,9 @@ class Plant:
         p, q = x[:2], x[4:]
         self.robot.require_reachable(p)
         self._at = None
-        self._take(0.0)
         if self._quick is not None:
             self._quick.hand_over()
+        self._take(0.0)
         if guess is None:
             self._solver.start(p, q)
         else:
@@ -182,13 +183,20 @@ class Plant:
         n = self.robot.n_rods
         self._mass = read_only(mass + np.diag([payload - self.payload] * 2 + [0.0] * n)), slopes
         self.payload, self._mass_at = payload, None
+        self._tip_weight = self.robot.tip_weight + payload * np.array(self.robot.gravity)
+        if self.step_model is not None:
+            if self._quick is not None:
+                self._quick.hand_over()
+                self._quick = self._quick_at = None  # its graph has the mass of the tip
+            loaded = replace(self.robot, tip_mass=self.robot.tip_mass + payload)
+            self.step_model = replace(self.step_model, robot=loaded)
         if self._modal is not None:
             self._modal.rods.tip_mass = self.robot.tip_mass + payload
 
     @property
     def tip_weight(self) -> np.ndarray:
         """Of tip mass and payload, shape (2,) [N]."""
-        return np.asarray(self.robot.tip_weight + self.payload * np.array(self.robot.gravity))
+        return self._tip_weight
 
     @property
     def snaps(self) -> list[Snap]:
@@ -247,15 +255,11 @@ class Plant:
         """Return what a `step_graph` of ``step_model`` starts from at state x, following the branch."""
         assert self.step_model is not None
         assert isinstance(self._solver, RodSolver)
-        if self.payload:
-            raise ValueError(f"step graphs know no payload, and the tip carries {self.payload} kg; put it down first")
         force, mass = self.force_and_mass(x[:2], x[4:])
         return self.step_model.memory(self._solver.state.start, force, mass)
 
     def _step_quickly(self, x: np.ndarray, u: np.ndarray, f_ext: np.ndarray) -> np.ndarray | None:
-        """Step in one call, or None where that is not possible; such graphs know the tip's own mass only."""
-        if self.payload:
-            return None
+        """Step in one call, or None where that is not possible."""
         if self._quick is None:
             if self.step_model is None:
                 return None

@@ -32,8 +32,7 @@ _PAIRS = [[a, b] for b in range(3) for a in range(b + 1)]  # of poses, as column
 def rod_mass(segments: int, steps: int, scheme: str, layout: Layout | None = None) -> Any:
     """Graph of one rod of unit length and unit line density.
 
-    It calls the same small graphs for all segments: written out it would be so long that a processor spends most of its
-    time on fetching it.
+    It calls the same small graphs for all segments: written out, a C compiler takes minutes for it (see `compiled`).
 
     Parameters
     ----------
@@ -56,8 +55,8 @@ def rod_mass(segments: int, steps: int, scheme: str, layout: Layout | None = Non
     jacobians = jacobian(starts, *known)
     firsts = first_sweep(jacobians)
     seconds = second_sweep(jacobians, alone(starts, firsts, *known))
-    mass, products = integrals(starts, firsts, seconds, *known)
-    mass, products = (sum(ca.horzsplit(pieces, 3)) for pieces in (mass, products))
+    together = ca.repmat(ca.DM.eye(3), segments, 1)  # the sum over blocks that stand side by side
+    mass, products = (pieces @ together for pieces in integrals(starts, firsts, seconds, *known))
 
     column = {pair: k for k, (a, b) in enumerate(_PAIRS) for pair in ((a, b), (b, a))}
     slopes = [
@@ -90,7 +89,7 @@ def _sweeps(segments: int) -> tuple[Any, Any]:
 
 @lru_cache
 def _segment(h: float, steps: int, scheme: str, layout: Layout | None) -> tuple[Any, Any, Any]:
-    """Graphs of segments of length h from z = [theta, n_x, n_y, m] on; with a layout two arguments more, s and numbers.
+    """Graphs of a segment of length h from z = [theta, n_x, n_y, m] on; with a layout also of s and the rod's numbers.
 
     Returns
     -------
