@@ -154,6 +154,7 @@ def test_guesses_come_first_and_the_known_tuning_before_them(search, counted):
 
 def test_guesses_that_the_scene_has_no_room_for_are_left_out(search):
     late = replace(search, scene=replace(search.scene, delay=2))
+    assert tuning_space.space(late) == tuning_space.space(replace(search, keep_period=True))
     assert 0 < len(tuning_space.guesses(late)) < len(tuning_space.GUESSES)
     blind = replace(search, scene=replace(search.scene, tuning=replace(search.start, observer=None)))
     for one in (late, blind):
