@@ -94,7 +94,8 @@ def _prepare(search: Search, executor: Executor, progress: bool) -> Study:
     """Open or begin the study; its first trial is the start, which scores 1 by definition."""
     optuna = _optuna()
     start, name = search.start, search.scene.name
-    settings = {**described(search.scene, start, search.spread), "episodes": search.episodes, "seed": search.seed}
+    settings = {**described(search.scene, start, search.spread), "episodes": search.episodes, "seed": search.seed,
+                "keep_period": search.keep_period}  # fmt: skip
     study: Study = optuna.create_study(storage=_storage(search.storage), study_name=name, load_if_exists=True)
     theirs = study.user_attrs.get("settings")
     if theirs is None:
