@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: track test test-slow lint figures clean
+.PHONY: track test test-slow lint figures charts benchmarks clean
 
 track: $(READY)  ## follow the figure of eight in closed loop; pictures and table in results/lemniscate
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml
@@ -40,6 +40,13 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	cp results/fold_guard/*.png results/controllers/*.png docs/
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
 	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
+
+charts: $(READY)  ## speed against accuracy: three charts, their CSVs and the ratios, in docs/; wants an idle machine
+	$(BIN)/python -m experiments.accuracy_vs_speed --out results/charts
+	cp results/charts/accuracy_vs_speed_* docs/
+
+benchmarks: $(READY)  ## ratios of ours to fixed references against those kept in docs/benchmarks.json
+	$(BIN)/python -m experiments.benchmarks
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

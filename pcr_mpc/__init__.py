@@ -5,6 +5,7 @@ from .control.plan import Plan
 from .control.qp import QuadraticProgram, Reference, build_qp
 from .control.tuning import Limits, Tuning, load_tuning
 from .errors import (
+    CompilerError,
     ConvergenceError,
     InfeasibleError,
     ModelError,
@@ -24,10 +25,12 @@ from .plant.dynamics import Plant
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
 from .plant.robot import Robot, Rod, load_robot
+from .plant.rollout import Rollout, rollout
 from .plant.stability import Stability, all_equilibria, assess_stability, distance_to_fold
 from .plant.statics import solve_statics
 
 __all__ = [
+    "CompilerError",
     "ConvergenceError",
     "Equilibrium",
     "HoldMotors",
@@ -43,6 +46,7 @@ __all__ = [
     "Reference",
     "Robot",
     "Rod",
+    "Rollout",
     "Run",
     "Scene",
     "SimulationError",
@@ -62,6 +66,7 @@ __all__ = [
     "load_scene",
     "load_tuning",
     "make_controller",
+    "rollout",
     "simulate",
     "solve_statics",
 ]

@@ -41,10 +41,10 @@ from .report.tables import (
     equilibrium_record,
     equilibrium_table,
     summary_table,
-    times_table,
     tuning_comments,
     tuning_table,
 )
+from .report.timing import plot_timing, timing_tables
 from .report.trade_off import plot_trade_off
 
 _EXAMPLES = """\
@@ -136,9 +136,13 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--links", type=int, default=_LINKS, help=f"of each rod (default {_LINKS})")
     export.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file, such as planar_pair.xml")
 
-    timing = command("timing", _timing, "Time plant steps of every method and the control step against their budgets.")
+    timing = command(
+        "timing", _timing, "Time plant steps of every method and the control step against their budgets; draw it."
+    )
     timing.add_argument("scene", type=Path, help="scene file")
-    timing.add_argument("--steps", type=int, default=2000, help="plant steps per method (default 2000)")
+    timing.add_argument("--steps", type=int, default=100_000,
+                        help="plant steps and control steps (default 100000: two or three minutes)")  # fmt: skip
+    timing.add_argument("--out", type=Path, help="folder for the results (default results/timing/NAME)")
 
     tuning = command(
         "tune",
@@ -266,16 +270,13 @@ def _timing(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     if options.steps < 1:
         raise ValueError(f"--steps is {options.steps}, expected at least 1")
+    folder = options.out or Path("results") / "timing" / scene.name
+    folder.mkdir(parents=True, exist_ok=True)
     result = time_scene(scene, options.steps, progress=True)
-    if options.json:
-        print(json.dumps(result))
-        return 0
-    budgets = {"plant step": 1e6 * scene.plant.dt, "control step": 1e6 * scene.period}
-    errors = [f"{c['method']} {c['force_error']:.1e}" for c in result["components"] if "force_error" in c]
-    rows = [(f"{c['name']} ({c['method']})", c, budgets.get(c["name"])) for c in result["components"]]
-    print(f"\n{scene.name}\n\n{times_table(rows)}\n")
-    print(f"relative error of F along the run: {', '.join(errors)}")
-    print(", ".join(f"{name} {value}" for name, value in {**result["machine"], **result["versions"]}.items()))
+    result["files"] = {name: str(folder / name) for name in ("timing.json", "timing.png")}
+    (folder / "timing.json").write_text(json.dumps(result, indent=2) + "\n")
+    plot_timing(result, folder / "timing.png")
+    print(json.dumps(result) if options.json else f"\n{scene.name}\n\n{timing_tables(result)}\n\nwritten to {folder}")
     return 0
 
 

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,37 @@ def poses(pair: Robot, centre: Equilibrium) -> list[Equilibrium]:
         q = centre.q + rng.uniform(-0.4, 0.4, 2)
         found.append(solve_statics(pair, p, q, guess=centre))
     return found
+
+
+@pytest.fixture(scope="session")
+def general(pair: Robot) -> Robot:
+    """Weight, curvature, varying stiffness and stretch at once, and different for the two rods."""
+    rods = (
+        replace(pair.rods[0], curvature=(0.5, 1.0, 0.3), stiffness_factors=(1.2, 1.0, 0.7), axial_stiffness=5e3),
+        replace(pair.rods[1], curvature=-0.8, stiffness_factors=(1.0, 0.8), line_density=0.1),
+    )
+    return replace(pair, gravity=(2.0, -9.81), rods=rods)
+
+
+@pytest.fixture(scope="session")
+def bent(general: Robot) -> Equilibrium:
+    return solve_statics(general, (0.01, 0.24), (3.2, 0.1))
+
+
+@pytest.fixture(scope="session")
+def inextensible(general: Robot) -> Robot:
+    """The general rods but for their stretch."""
+    return replace(general, rods=tuple(replace(rod, axial_stiffness=np.inf) for rod in general.rods))
+
+
+@pytest.fixture(scope="session")
+def heavy() -> Robot:
+    return load_robot(MODELS / "heavy_pair.toml")
+
+
+@pytest.fixture(scope="session")
+def sagging(heavy: Robot) -> Equilibrium:
+    return inverse_statics(heavy, (0.0, 0.25), mode="LR")
 
 
 def random_pose(robot: Robot, rng: np.random.Generator, reach: float) -> tuple[np.ndarray, np.ndarray]:

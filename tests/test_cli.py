@@ -66,17 +66,31 @@ def test_statics_three_ways(capsys, tmp_path):
     assert "0.927501" in capsys.readouterr().out
 
 
-def test_timing(scene, capsys):
-    assert main(["timing", str(scene), "--steps", "100", "--json"]) == 0
+def test_timing(scene, tmp_path, capsys):
+    assert main(["timing", str(scene), "--steps", "100", "--json", "--out", str(tmp_path / "t")]) == 0
     result = json.loads(capsys.readouterr().out)
     names = {(c["name"], c["method"]) for c in result["components"]}
     assert {("plant step", m) for m in ("closed_form", "multiple_shooting", "single_shooting")} <= names
-    assert ("control step", "closed_form") in names
+    for name in ("control step", "linearise", "QP update", "inside OSQP", "observer"):
+        assert (name, "closed_form") in names
     for component in result["components"]:
-        assert 0 < component["p50"] <= component["p95"] <= component["p99"] <= component["max"]
+        ordered = [component[key] for key in ("p50", "p95", "p99", "p99.9", "max")]
+        assert 0 < ordered[0]
+        assert ordered == sorted(ordered)
         assert component["n"] > 0
+    step = next(c for c in result["components"] if c["name"] == "control step")
+    assert set(step["misses"]) == {"100 Hz", "200 Hz", "500 Hz"}
+    assert step["n"] == 80
+    assert len(step["first"]) == 20
+    assert sum(sum(counts) for counts in result["histogram"]["control step"].values()) == 80
+    assert sum(row["n"] for row in result["iterations"]) == 80 - step["interrupted"]
+    if not step["interrupted"]:
+        assert sum(result["control_parts"].values()) == pytest.approx(step["mean"])
+    assert {row["name"] for row in result["overhead"]} == {"graph", "plain call", "Plant.step", "rollout"}
     assert result["versions"]["casadi"]
     assert result["machine"]["cores"] >= 1
+    assert json.loads((tmp_path / "t" / "timing.json").read_text()) == result
+    assert (tmp_path / "t" / "timing.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

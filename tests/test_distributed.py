@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import eigh, null_space
 from scipy.optimize import brentq
 
-from pcr_mpc import ConvergenceError, Plant, inverse_statics, load_robot
+from pcr_mpc import ConvergenceError, ModelError, Plant, inverse_statics, load_robot, solve_statics
 from pcr_mpc.plant.distributed import DistributedRods
 from pcr_mpc.plant.rod import sample_rod
 from pcr_mpc.plant.strain_modes import StrainModes
@@ -49,18 +49,19 @@ def test_frequencies_of_beams(pair):
         assert frequencies == pytest.approx(expected, rel=1e-6)
 
 
-def test_blocks_against_differences(pair):
+@pytest.mark.parametrize("which", ["pair", "inextensible"])
+def test_blocks_against_differences(which, request):
     """Of bent rods in motion."""
-    rng, modes, n_modes = np.random.default_rng(5), StrainModes(pair, 6), 6
+    rng, modes, n_modes = np.random.default_rng(5), StrainModes(request.getfixturevalue(which), 6), 6
     q, u, tip_forces = rng.normal(size=2), rng.normal(size=2), rng.normal(size=(2, 2))
     motion = rng.normal(size=(3, 2, n_modes))
 
     def angles(motion):
-        return [modes.angles(a, b) for a, b in zip(motion, (q, u, 0 * q), strict=True)]
+        return modes.angles(motion[0], q), modes.turned(motion[1], u), modes.turned(motion[2], 0 * q)
 
     def forces(motion):
         on_modes, tips = modes.forces(*angles(motion), tip_forces)
-        return np.concatenate([on_modes + modes.elastic * motion[0], tips], axis=1)
+        return np.concatenate([on_modes + modes.elastic_moments(motion[0]), tips], axis=1)
 
     blocks = modes.blocks(*angles(motion), tip_forces)
     wanted = (
@@ -99,6 +100,21 @@ def test_rods_at_rest_are_the_closed_form(pair, poses):
         errors = np.array(errors)
         assert (errors[1] < 0.03 * errors[0]).all()
         assert (errors[2] < [1e-9, 1e-6, 1e-4]).all()
+
+
+def test_rods_at_rest_are_those_of_multiple_shooting(inextensible):
+    """As above, with weight, and with knots in their curvature and stiffness."""
+    still, errors = np.zeros(2), []
+    pose = solve_statics(inextensible, (0.01, 0.24), (3.2, 0.1), segments=16, steps=2)
+    for n_modes in (6, 10, 14):
+        rods = DistributedRods(inextensible, n_modes)
+        settled = rods.settled(pose.p, still, pose.q, pose.nodes)
+        held = rods.step(settled, still, pose.force, 1e-3)
+        accelerated = inextensible.tip_mass * np.linalg.norm(held.v) / 1e-3
+        errors.append([abs(rods.energy(settled) / pose.energy - 1), accelerated])
+    errors = np.array(errors)
+    assert (errors[1] < 0.01 * errors[0]).all()
+    assert (errors[2] < [1e-10, 1e-8]).all()
 
 
 def test_modes_converge(pair, centre):
@@ -140,6 +156,57 @@ def test_the_pin_holds(pair, centre):
         assert ends == pytest.approx(np.stack([at.p] * 2), abs=1e-12)
         velocities = pair.lengths[:, None] * rods.modes.tip_velocities(at.a, at.a_dot, at.q, at.u)
         assert velocities == pytest.approx(np.stack([at.v] * 2), abs=1e-12)
+
+
+def test_energy_with_weight(inextensible):
+    """Of rods and tip; their height counts."""
+    robot = replace(inextensible, drag=0.0)
+    pose = solve_statics(robot, (0.01, 0.24), (3.2, 0.1))
+    rods = DistributedRods(robot, 8)
+    motion = [rods.settled(pose.p, np.array([0.3, -0.2]), pose.q, pose.nodes)]
+    for _ in range(100):
+        motion.append(rods.step(motion[-1], np.zeros(2), robot.tip_weight, 1e-3))
+    heights = np.array([-robot.tip_weight @ at.p for at in motion])
+    assert np.ptp(heights + [rods.energy(at) for at in motion]) < 1e-10
+    assert np.ptp(heights) > 1e-3
+
+
+@pytest.mark.parametrize("u", [(0.0, 0.0), (1.0, -0.5)])
+def test_heavy_rods_that_sag(heavy, sagging, u):
+    """Whose weight makes no difference to the impulse of motors that jump."""
+    reference = released(heavy, sagging, u=u)
+    errors = {
+        inertia: distance(released(heavy, sagging, u=u, inertia=inertia, integrator="rk4"), reference)
+        for inertia in ("none", "constant", "condensed")
+    }
+    assert errors["condensed"] < 0.06
+    assert errors["condensed"] < 0.6 * errors["constant"]
+    assert errors["none"] > 5.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("model", "gravity", "none", "constant", "condensed"),
+    [
+        ("heavy_pair", -9.81, 20.0, 2.5, 0.1),
+        ("planar_pair", -9.81, 2.0, 0.4, 0.002),
+        ("curved_pair", 0.0, 2.0, 0.4, 0.002),
+    ],
+)
+def test_a_second_of_free_motion_of_rods_as_built(model, gravity, none, constant, condensed):
+    """Let go 30 mm to the right of the balance and 20 mm above it; errors in mm: at least, at most, at most."""
+    robot = replace(load_robot(MODELS / f"{model}.toml"), gravity=(0.0, gravity))
+    rest = inverse_statics(robot, (0.0, 0.25), mode="LR")
+    pose = solve_statics(robot, rest.p + [0.03, 0.02], rest.q, guess=rest)
+    reference, fewer = (released(robot, pose, (0.0, 0.0), seconds=1.0, modes=modes) for modes in (14, 10))
+    assert distance(fewer, reference) < 1e-4
+    errors = {
+        inertia: distance(released(robot, pose, (0.0, 0.0), seconds=1.0, inertia=inertia, integrator="rk4"), reference)
+        for inertia in ("none", "constant", "condensed")
+    }
+    assert errors["none"] > none
+    assert errors["constant"] < constant
+    assert errors["condensed"] < condensed
 
 
 @pytest.mark.parametrize("u", [(0.0, 0.0), (1.0, -0.5)])
@@ -227,5 +294,10 @@ def test_bad_arguments_are_named(pair):
         Plant(pair, inertia="full", integrator="rk4")
     with pytest.raises(ValueError, match="inertia='none' does not go with integrator='gauss'"):
         Plant(pair, integrator="gauss")
+    stretching = replace(pair, rods=tuple(replace(rod, axial_stiffness=1e4) for rod in pair.rods))
+    with pytest.raises(ModelError, match="do not stretch, and a rod of planar_pair does"):
+        Plant(stretching, inertia="full", integrator="gauss")
+    with pytest.raises(ValueError, match="take weight='exact' or 'none'"):
+        Plant(replace(pair, gravity=(0.0, -9.81)), method="closed_form", inertia="full", integrator="gauss")
     with pytest.raises(ValueError, match="modes = 3 must be a whole number from 4 to 64"):
         Plant(pair, inertia="full", integrator="gauss", modes=3)

@@ -116,6 +116,26 @@ def test_the_release_of_the_scene(pair, centre):
     assert errors["none"] > 2.0
 
 
+def test_chains_with_weight_start_in_mujocos_equilibrium(inextensible):
+    """A tip too heavy to move is held up by a force that carries it."""
+    robot = replace(inextensible, tip_mass=1e9)
+    pose = solve_statics(robot, (0.01, 0.24), (3.2, 0.1))
+    plant, x = MuJoCoPlant(robot, links=20), state(pose, (0.0, 0.0))
+    plant.reset(x, pose)
+    began = plant._data.qpos.copy()
+    for _ in range(20):
+        x = plant.step(x, (0.0, 0.0), -robot.tip_weight)
+    assert np.abs(plant._data.qpos - began).max() < 1e-6
+
+
+def test_weight_curvature_and_varying_stiffness(inextensible):
+    pose, settings = inverse_statics(inextensible, (0.0, 0.25), mode="LR"), {"u": (1.0, -0.5), "seconds": 0.1}
+    reference = released(inextensible, pose, **settings)
+    errors = [distance(in_mujoco(inextensible, pose, dt=2e-3, links=n, **settings), reference) for n in (10, 20)]
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
+    assert errors[1] < 0.01 * distance(reference, reference[:1])
+
+
 def test_a_load_on_the_tip(pair, centre):
     moved = []
     for plant in (MuJoCoPlant(pair, links=20), Plant(pair, inertia="full", integrator="gauss")):
@@ -214,6 +234,9 @@ def test_bad_arguments_are_named(pair, monkeypatch):
         mjcf(weightless)
     with pytest.raises(ModelError, match="rod 1 has line_density 0"):
         MuJoCoPlant(weightless)
+    stretching = replace(pair, rods=(pair.rods[0], replace(pair.rods[1], axial_stiffness=1e4)))
+    with pytest.raises(ModelError, match="rod 1 stretches, but the links of the model for MuJoCo are rigid"):
+        MuJoCoPlant(stretching)
     with pytest.raises(ValueError, match="links = 1 must be a whole number from 2 to 1000"):
         MuJoCoPlant(pair, links=1)
     with pytest.raises(ValueError, match=r"dt is 0\.0 s"):
@@ -292,3 +315,15 @@ def test_endless_links_are_the_distributed_rods(pair, displaced):
         states = released(pair, displaced, (0.0, 0.0), seconds=1.0, dt=1e-3, inertia=inertia, integrator=integrator)
         assert distance(states, endless) < largest
     assert distance(states, endless) > 0.3
+
+
+@pytest.mark.slow
+def test_endless_links_are_the_distributed_rods_that_sag(heavy, sagging):
+    chains = [in_mujoco(heavy, sagging, seconds=1.0, links=links) for links in (40, 80)]
+    endless = (4 * chains[1] - chains[0]) / 3
+    errors = [
+        distance(released(heavy, sagging, seconds=1.0, dt=1e-3, inertia=inertia, integrator=integrator), endless)
+        for inertia, integrator in (("full", "gauss"), ("condensed", "rk4"), ("none", "rk4"))
+    ]
+    assert errors[0] < 0.01 < errors[1] < 0.06
+    assert errors[2] > 20.0

@@ -55,3 +55,26 @@ def test_do_mpc_failing_is_an_error(scene):
     x = np.array([0.0, 0.25, 0.0, 0.0, 9.0, 9.0])  # far beyond the stops
     with pytest.raises(InfeasibleError, match="was not solved in period 3"):
         controller.step(3, x)
+
+
+def test_crocoddyl_decides_as_the_nonlinear_mpc(scene):
+    """Without limits that it does not know: DDP on the plant itself, the same inputs."""
+    pytest.importorskip("crocoddyl")
+    from experiments.crocoddyl_controller import Crocoddyl
+
+    pose = scene.start()
+    theirs, ours = Crocoddyl(scene, scene.tuning), TrackingController(scene, scene.tuning)
+    theirs.start(pose)
+    ours.start(pose)
+    plant = Plant(scene.robot, integrator="rk4", dt=1e-3)
+    x = np.concatenate([pose.p + [2e-4, -1e-4], [0.0, 0.0], pose.q])
+    plant.reset(x, pose)
+    fastest = 0.0
+    for k in range(12):
+        u = theirs.step(k, x).u
+        assert ours.step(k, x).u == pytest.approx(u, abs=2e-3)
+        fastest = max(fastest, np.abs(u).max())
+        for _ in range(10):
+            x = plant.step(x, u)
+    assert fastest > 0.1
+    assert len(theirs.iterations) == 12

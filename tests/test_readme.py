@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from .conftest import ROOT
 
@@ -19,6 +20,12 @@ def test_python_example(monkeypatch, capsys):
     assert float(lines[-1]) < 1e-5
 
 
-def test_pictures_exist():
-    for path in re.findall(r"!\[.*?\]\((.*?)\)", (ROOT / "README.md").read_text()):
-        assert (ROOT / path).stat().st_size > 5_000
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name
+)
+def test_links_and_pictures_exist(page):
+    links = re.findall(r"\[.*?\]\((.*?)\)", page.read_text())
+    assert links
+    for link in links:
+        target = page.parent / link.partition("#")[0]
+        assert target.stat().st_size > (5_000 if target.suffix in (".png", ".gif") else 0), link

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import inverse_statics, load_scene, load_tuning, make_controller, simulate
+from pcr_mpc import ConvergenceError, inverse_statics, load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.loop.feed_forward import feed_forward
 from pcr_mpc.loop.target import MotorTarget
 
@@ -64,3 +64,10 @@ def test_statics_are_solved_for_the_target_only_where_the_shift_is_large(lemnisc
         counts.append(len(calls))
     assert counts[0] == 0
     assert counts[1] > 40
+
+
+def test_inverse_dynamics_that_do_not_settle_are_refused(lemniscate, monkeypatch):
+    monkeypatch.setattr("pcr_mpc.loop.feed_forward._MOST_SWEEPS", 1)
+    with pytest.raises(ConvergenceError, match=r"did not settle.*slower reference") as caught:
+        feed_forward(lemniscate, lemniscate.robot, lemniscate.start(), 10, "condensed")
+    assert 1e-5 < caught.value.residual < 1e-1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,7 +20,6 @@ _FORCE_CHANGED = 1e-5  # N
 @dataclass
 class _Spot:
     plant: Plant  # follows the rods from one point of linearisation to the next
-    at: np.ndarray | None = None
     model: LinearModel | None = None
 
 
@@ -43,25 +42,35 @@ class AlongPlan:
         length = float(plants[0].robot.lengths.mean()) if plants else 1.0
         n = plants[0].robot.n_rods if plants else 0
         self._moved = _MOVED * np.array([length] * 2 + [1.0] * n)
+        self._at = np.full((len(plants), 2 + n), np.nan)  # where each model was made; NaN: there is none
 
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
         """Forget the models; all rods are in ``pose``."""
+        self._at[:] = np.nan
         for spot in self._spots:
             spot.plant.reset(x, pose)
-            spot.at = spot.model = None
+            spot.model = None
 
     def models(self, path: np.ndarray, u: np.ndarray, force: np.ndarray) -> list[LinearModel]:
         """Models about the states of ``path``, shape (N - 1, 4 + n), under an external force; errors as `linearise`."""
+        places = np.concatenate([path[:, :2], path[:, 4:]], axis=1)
+        # So written that NaN is far.
+        near = (np.abs(places - self._at) <= self._moved).all(axis=1).tolist()
         found = []
-        for spot, x in zip(self._spots, path, strict=True):
-            at = np.concatenate([x[:2], x[4:]])
-            if spot.model is None or spot.at is None or (np.abs(at - spot.at) > self._moved).any():
-                spot.at, spot.model = at, linearise(spot.plant, x, u, self._period, force)
-            elif max(map(abs, (force - spot.model.force).tolist())) > _FORCE_CHANGED:
-                c = spot.model.c + spot.model.E @ (force - spot.model.force)
-                spot.model = replace(spot.model, c=c, force=force.copy())
-            found.append(spot.model)
+        for k, spot in enumerate(self._spots):
+            model = spot.model
+            if model is None or not near[k]:
+                self._at[k] = np.nan
+                model = linearise(spot.plant, path[k], u, self._period, force)
+                self._at[k] = places[k]
+            elif max(map(abs, (force - model.force).tolist())) > _FORCE_CHANGED:
+                c = model.c + model.E @ (force - model.force)
+                model = LinearModel(model.A, model.B, c, model.E, model.dt, force.copy())
+            spot.model = model
+            found.append(model)
         if self._spots:
+            # The next place of the first spot is the new end of the horizon.
             self._spots.rotate(-1)
-            self._spots[-1].at = self._spots[-1].model = None  # its next place is the new end of the horizon
+            self._at[:-1] = self._at[1:]
+            self._at[-1] = np.nan
         return found

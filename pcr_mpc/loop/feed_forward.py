@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..control.qp import Reference
-from ..errors import PCRError
+from ..errors import ConvergenceError, PCRError
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import inverse_statics
@@ -66,6 +66,8 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     ------
     PCRError
         The reference leaves the workspace; the message says when.
+    ConvergenceError
+        The inertia of the rods changes the angles too much for the fixed point.
     """
     assert scene.trajectory is not None
     t = scene.period * np.arange(scene.n_periods + horizon + 1)
@@ -78,10 +80,19 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
             plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
             momentum, push, own = _momentum(plant, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
             forces = push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
-            before = q
-            q, levers = _angles(robot, pose, t, p, forces)
-            if np.abs(q - before).max() < _SETTLED:
+            before, (q, levers) = q, _angles(robot, pose, t, p, forces)
+            change = float(np.abs(q - before).max())
+            if change < _SETTLED:
                 break
+        else:
+            raise ConvergenceError(
+                f"the inverse dynamics of {scene.name} with rods of inertia {inertia!r} did not settle: the motor "
+                f"angles still change by {change:.1e} rad in sweep {_MOST_SWEEPS}; take a slower reference or "
+                "inertia 'none'",
+                residual=change,
+                iterations=_MOST_SWEEPS,
+                last=q,
+            )
         v = own
     rates = np.diff(q, axis=0) / scene.period
     return InverseDynamics(np.hstack([p, v, q]), rates, forces, angles_per_force=levers)
@@ -90,14 +101,16 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
 def _angles(
     robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Motor angles at which the rods carry the forces at the tips p, and their least change per force (K, n, 2)."""
+    """Motor angles at which the rods carry the forces at the tips p, (K, n) [rad], and their change by one more newton,
+    (K, n, 2) [rad/N]."""
     angles, levers, eq = np.empty((len(t), robot.n_rods)), np.empty((len(t), robot.n_rods, 2)), pose
     for k in range(len(t)):
         try:
             eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
             raise type(error)(f"reference at t = {t[k]:.3f} s: {error}", **error.details) from None
-        angles[k], levers[k] = eq.q, np.linalg.pinv(eq.dforce_dq)
+        angles[k] = eq.q
+        levers[k] = np.linalg.pinv(eq.dforce_dq)
     return angles, levers
 
 

@@ -33,7 +33,8 @@ def by_model_inertia(
         method knows no other.
     """
     found = {tuning.model.inertia: run}
-    others = [inertia for inertia in INERTIAS if inertia not in found] if tuning.model.method == "closed_form" else []
+    known = INERTIAS if tuning.model.method != "single_shooting" else ()
+    others = [inertia for inertia in known if inertia not in found]
     for inertia in others:
         other = replace(tuning, model=replace(tuning.model, inertia=inertia))
         try:

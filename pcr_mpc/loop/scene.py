@@ -213,8 +213,8 @@ def load_scene(path: str | Path) -> Scene:
             )
             if (plant.inertia == "full") != (plant.integrator == "gauss"):
                 raise table.fail("integrator", f"is {plant.integrator}: inertia 'full' needs 'gauss', and only it does")
-            if plant.inertia != "none" and plant.method != "closed_form":
-                raise table.fail("inertia", f"is {plant.inertia}, which needs method 'closed_form', not {plant.method}")
+            if plant.inertia != "none" and plant.method == "single_shooting":
+                raise table.fail("inertia", f"is {plant.inertia}, which method 'single_shooting' does not know")
         with file.table("control") as control:
             period = control.number("period", above=0.0)
             tuning = control.text("tuning", None)

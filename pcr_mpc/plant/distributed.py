@@ -69,7 +69,7 @@ class DistributedRods:
         ConvergenceError
             The modes cannot take that shape.
         """
-        a, forces = self.modes.fitted(nodes), nodes[:, 1:3, 0].copy()
+        a, forces = self.modes.fitted(nodes), nodes[:, 1:3, 0] - self.modes.weight
         target = (p - self.robot.bases) / self.robot.lengths[:, None]
         for _ in range(_MOST_ITERATIONS):
             theta = self.modes.angles(a, q)
@@ -79,7 +79,7 @@ class DistributedRods:
             systems[:, :-2, :-2] = blocks.stiffness
             systems[:, :-2, -2:] = -np.swapaxes(blocks.jacobian, 1, 2)
             systems[:, -2:, :-2] = blocks.jacobian
-            residual = self.modes.forces(theta, at_rest, at_rest, forces)[0] + self.modes.elastic * a
+            residual = self.modes.forces(theta, at_rest, at_rest, forces)[0] + self.modes.elastic_moments(a)
             right = np.concatenate([-residual, target - self.modes.tips(a, q)], axis=1)
             step = np.linalg.solve(systems, right[:, :, None])[:, :, 0]
             a, forces = a + step[:, :-2], forces + step[:, -2:]
@@ -107,8 +107,8 @@ class DistributedRods:
         # The equations are linear in accelerations and pin forces.
         nothing = np.zeros(self._size)
         start = self._solve(state, -self._residual(y, y_dot, nothing, state.q, u, f_ext))
-        theta, turning = self.modes.angles(state.a, state.q), self.modes.angles(state.a_dot, u)
-        faster = self.modes.angles(start[: width - 2].reshape(n, -1), np.zeros(n))
+        theta, turning = self.modes.angles(state.a, state.q), self.modes.turned(state.a_dot, u)
+        faster = self.modes.turned(start[: width - 2].reshape(n, -1), np.zeros(n))
         blocks = self.modes.blocks(theta, turning, faster, start[width:].reshape(n, 2))
         factors = lu_factor(self._stage_system(blocks, dt))
         q = state.q + dt * _NODES[:, None] * u
@@ -132,9 +132,9 @@ class DistributedRods:
         return self._pinned(ModalState(a, a_dot, y[-2:], y_dot[-2:], state.q + dt * u, u.copy()))
 
     def energy(self, state: ModalState) -> float:
-        """Kinetic and elastic energy [J]."""
-        kinetic, elastic = self.modes.energies(state.a, state.a_dot, state.q, state.u)
-        of_rods = (kinetic + elastic) @ (self.robot.stiffnesses / self.robot.lengths)
+        """Kinetic energy, and that of the rods' bending and weight [J]."""
+        kinetic, potential = self.modes.energies(state.a, state.a_dot, state.q, state.u)
+        of_rods = (kinetic + potential) @ (self.robot.stiffnesses / self.robot.lengths)
         return float(of_rods + self.robot.tip_mass * state.v @ state.v / 2)
 
     def _residual(
@@ -146,9 +146,9 @@ class DistributedRods:
         forces, acceleration = unknowns[..., width:].reshape(*stages, n, 2), unknowns[..., width - 2 : width]
         still = np.zeros_like(q)
         on_modes, tips = self.modes.forces(
-            self.modes.angles(a, q), self.modes.angles(a_dot, u), self.modes.angles(faster, still), forces
+            self.modes.angles(a, q), self.modes.turned(a_dot, u), self.modes.turned(faster, still), forces
         )
-        on_modes += self.modes.elastic * a
+        on_modes += self.modes.elastic_moments(a)
         on_tip = self.robot.tip_mass * acceleration + self.robot.drag * y_dot[..., -2:] - f_ext
         on_tip += (self._units[:, None] * forces).sum(axis=-2)
         pins = self.robot.lengths[:, None] * tips - acceleration[..., None, :]
@@ -198,8 +198,10 @@ class DistributedRods:
             return state
         n, width = self.robot.n_rods, self._n_modes + 2
         theta = self.modes.angles(state.a, state.q)
-        jumps = self.modes.angles(np.zeros_like(state.a), jump)
-        impulses, tips = self.modes.forces(theta, np.zeros_like(theta), jumps, np.zeros((n, 2)))
+        jumps = self.modes.turned(np.zeros_like(state.a), jump)
+        still, nothing = np.zeros_like(theta), np.zeros((n, 2))
+        impulses, tips = self.modes.forces(theta, still, jumps, nothing)
+        impulses -= self.modes.forces(theta, still, still, nothing)[0]  # the weight takes its time
         right = np.concatenate([impulses.ravel(), np.zeros(2), (self.robot.lengths[:, None] * tips).ravel()])
         change = self._solve(state, -right)
         a_dot = state.a_dot + change[: width - 2].reshape(n, -1)

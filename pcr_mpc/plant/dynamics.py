@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..buffered import BufferedFunction
 from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
 from ..frozen import read_only
 from .equilibrium import Equilibrium
-from .inertia import INERTIAS, robot_mass
+from .inertia import INERTIAS
 from .integrators import INTEGRATORS
+from .mass_matrix import CondensedMass, MassMatrix, tip_mass
 from .modal_step import ModalStep
+from .quick_step import QuickStep
 from .robot import Robot
 from .rod_solver import RodSolver, Snap
 from .rod_state import RobotState
 from .statics import checked_shooting, default_method, make_solver
+from .step_graph import LARGEST_DRIFT, PREDICTOR_ACCURACY, StepModel
 from .weight import WEIGHTS, CondensedWeight
 
 ON_SNAP = ("raise", "jump")
-# A simulation uses the derivatives only to predict the next pose.
-_PREDICTOR_ACCURACY = 1e-2
 # Residual of the statics at which derivatives may be taken for a linear model; their error is of this size.
 DERIVATIVE_ACCURACY = 1e-6
-# Relative drift of a rod's invariant beyond which its force may be off by per cents.
-_LARGEST_DRIFT = 1e-3
 _MOST_MODES = 64
 
 
@@ -47,7 +44,7 @@ class Plant:
     inertia : {"none", "constant", "condensed", "full"}
         Of the rods: none, the paper's; the mass matrix M(p, q) that their quasi-static shapes carry (see `inertia`)
         as it was at the last `reset`; M(p, q) with its Coriolis terms; or distributed mass in strain modes, the
-        yardstick (see `strain_modes`). With mass the statics must be the closed form.
+        yardstick (see `strain_modes`). Single shooting knows none but the first.
     modes : int
         Strain modes per rod, of inertia "full": 12 are within 1e-6 mm of 14 on the default robot.
     weight : {"none", "condensed", "exact"}, optional
@@ -64,6 +61,9 @@ class Plant:
         Where a rod's branch ends: `UnstableError`, or the rod falls at once to the stable shape that the descent of
         its energy reaches, which is recorded in ``snaps`` with the energy lost (RK4 looks ahead within a step, so
         that the tip position recorded may be off by that much).
+    compiled : bool
+        Whether `step` and `rollout` run as machine code: the same numbers, faster by half to three times, after a
+        second or so of compiling at the first step; needs a C compiler (`CompilerError` where there is none).
 
     Notes
     -----
@@ -95,6 +95,7 @@ class Plant:
         integrator: str = "semi_implicit_euler",
         dt: float = 1e-3,
         on_snap: str = "raise",
+        compiled: bool = False,
     ) -> None:
         if on_snap not in ON_SNAP:
             raise ValueError(f"on_snap is {on_snap!r}, expected one of {', '.join(ON_SNAP)}")
@@ -113,12 +114,12 @@ class Plant:
         method = method or default_method(rods)
         if weight == "condensed" and method != "closed_form":
             raise ValueError(f"weight='condensed' needs method='closed_form', not {method!r}; take weight='exact'")
-        if weight != "none" and inertia == "full":
-            raise ValueError(f"inertia='full' has weightless rods, not weight={weight!r}; take weight='none'")
+        if weight == "condensed" and inertia == "full":
+            raise ValueError("inertia='full' does not condense the rods' weight; take weight='exact' or 'none'")
+        if inertia != "none" and method == "single_shooting":
+            raise ValueError(f"inertia={inertia!r} needs method='closed_form' or 'multiple_shooting', not {method!r}")
         if not 0.0 < dt < np.inf:
             raise ValueError(f"dt is {dt} s, expected a positive number")
-        if inertia != "none" and method != "closed_form":
-            raise ValueError(f"inertia is {inertia!r}, which needs method='closed_form', not {method!r}")
         if isinstance(modes, bool) or not isinstance(modes, int | np.integer) or not 4 <= modes <= _MOST_MODES:
             raise ValueError(f"modes = {modes!r} must be a whole number from 4 to {_MOST_MODES}")
         self.robot = robot
@@ -127,19 +128,27 @@ class Plant:
         self.weight = weight
         self.integrator = integrator
         self.dt = dt
+        self.compiled = compiled
         self.n_states = 4 + robot.n_rods
-        self._modal = ModalStep(robot, int(modes)) if inertia == "full" else None
+        self._modal = ModalStep(rods, int(modes)) if inertia == "full" else None
         self._advance = self._modal or INTEGRATORS[integrator](robot.n_rods)
         self._mass_moves = inertia in ("condensed", "full")
         self._solver = make_solver(rods, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
         self._sag = CondensedWeight(robot) if weight == "condensed" else None
-        self._at: tuple[float, ...] | None = None
+        self._at: list[float] | None = None
         self._accuracy = 0.0  # of the derivatives there
-        n = robot.n_rods
-        tip_alone = np.diag([robot.tip_mass] * 2 + [0.0] * n)
-        self._mass = read_only(tip_alone), read_only(np.zeros(((2 + n) ** 2, 2 + n)))
-        self._mass_at: tuple[float, ...] | None = None
-        self._condensed = None if inertia == "none" else BufferedFunction(robot_mass(robot))
+        self._mass = tip_mass(robot)
+        self._mass_at: list[float] | None = None
+        self._condensed: CondensedMass | None = None
+        self.step_model: StepModel | None = None
+        if isinstance(self._solver, RodSolver):
+            of_rods = self._solver.method
+            if inertia != "none":
+                self._condensed = CondensedMass(robot, of_rods)
+            if inertia != "full":
+                self.step_model = StepModel(robot, rods, of_rods, integrator, inertia, weight == "condensed", dt)
+        self._quick: QuickStep | None = None
+        self._quick_at: list[float] | None = None
 
     def reset(self, x: Any, guess: Equilibrium | None = None) -> None:
         """Put the rods on the branch of ``guess`` at state x, or on the branch of least energy (None)."""
@@ -147,6 +156,8 @@ class Plant:
         p, q = x[:2], x[4:]
         self.robot.require_reachable(p)
         self._at = None
+        if self._quick is not None:
+            self._quick.hand_over()
         if guess is None:
             self._solver.start(p, q)
         else:
@@ -155,7 +166,8 @@ class Plant:
         if self._modal is not None:
             self._modal.forget()
         if self.inertia == "constant":
-            self._mass = self._condensed_mass(q)[0], self._mass[1]
+            assert self._condensed is not None
+            self._mass = self._condensed(self._unknowns(), q)[0], self._mass[1]
 
     @property
     def tip_weight(self) -> np.ndarray:
@@ -166,6 +178,15 @@ class Plant:
     def snaps(self) -> list[Snap]:
         """Snaps since the reset, in order."""
         return self._solver.snaps
+
+    @property
+    def residual(self) -> float:
+        """Residual of the rods at the last pose that was solved, added up over them; not for single shooting."""
+        if not isinstance(self._solver, RodSolver):
+            raise ValueError(f"method {self.method} keeps no residual")
+        if self._quick is not None:
+            self._quick.hand_over()
+        return float(self._solver.state.residual)
 
     @property
     def rungs(self) -> dict[str, int]:
@@ -195,18 +216,49 @@ class Plant:
         """
         x = checked_vector("x", x, self.n_states)
         u = checked_vector("u", u, self.robot.n_rods)
-        f_ext = checked_vector("f_ext", f_ext, 2) + self.tip_weight
-        rate = self.robot.motor_rates(u, x[4:], self.dt)
+        f_ext = checked_vector("f_ext", f_ext, 2)
         try:
-            return np.asarray(self._advance(self, x, rate, f_ext))
+            end = self._step_quickly(x, u, f_ext)
+            if end is None:
+                rate = self.robot.motor_rates(u, x[4:], self.dt)
+                end = self._advance(self, x, rate, f_ext + self.tip_weight)
         except PCRError as error:
             error.details["state"] = x.copy()
             raise
+        return np.asarray(end)
+
+    def memory(self, x: np.ndarray) -> np.ndarray:
+        """Return what a `step_graph` of ``step_model`` starts from at state x, following the branch."""
+        assert self.step_model is not None
+        assert isinstance(self._solver, RodSolver)
+        force, mass = self.force_and_mass(x[:2], x[4:])
+        return self.step_model.memory(self._solver.state.start, force, mass)
+
+    def _step_quickly(self, x: np.ndarray, u: np.ndarray, f_ext: np.ndarray) -> np.ndarray | None:
+        """Step in one call, or None where that is not possible."""
+        if self._quick is None:
+            if self.step_model is None:
+                return None
+            assert isinstance(self._solver, RodSolver)
+            self._quick = QuickStep(self.step_model, self._solver, compiled=self.compiled)
+        at = x.tolist()
+        del at[2:4]
+        if self._at is not self._quick_at or at != self._at:
+            self._quick.load(self.memory(x))
+            self._quick_at = self._at
+        end = self._quick(x, u, f_ext)
+        if end is None:
+            return None
+        at = end.tolist()
+        del at[2:4]
+        self._at = self._quick_at = at
+        self._accuracy = PREDICTOR_ACCURACY
+        return end.copy()
 
     def force(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         """F at (p, q), following the branch [N]; the tip is at rest where it is the tip's weight plus F_ext."""
         q = np.asarray(q, dtype=float)
-        self._go(np.asarray(p, dtype=float), q, _PREDICTOR_ACCURACY)
+        self._go(np.asarray(p, dtype=float), q, PREDICTOR_ACCURACY)
         if self._sag is None:
             return self._solver.force()
         return read_only(self._solver.force() + self._sag.first(self._unknowns(), q)[1][:2])
@@ -235,7 +287,7 @@ class Plant:
         self._go(p, q, DERIVATIVE_ACCURACY)
         return self._solver.state
 
-    def mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def mass(self, p: np.ndarray, q: np.ndarray) -> MassMatrix:
         """Mass matrix at (p, q), following the branch, for the velocities w = [p', q'].
 
         Returns
@@ -247,11 +299,12 @@ class Plant:
         """
         return self.force_and_mass(p, q)[1] if self._mass_moves else self._mass
 
-    def force_and_mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    def force_and_mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, MassMatrix]:
         """`force` and `mass` at the same pose."""
         force = self.force(p, q)
         if self._mass_moves and self._mass_at is not self._at:
-            self._mass, self._mass_at = self._condensed_mass(q), self._at
+            assert self._condensed is not None
+            self._mass, self._mass_at = self._condensed(self._unknowns(), q), self._at
         return force, self._mass
 
     def tip_velocity(self, x: Any, u: Any) -> np.ndarray:
@@ -284,7 +337,9 @@ class Plant:
         return self._solver.state.unknowns
 
     def _go(self, p: np.ndarray, q: np.ndarray, derivatives: float | None) -> None:
-        at, accuracy = (*p.tolist(), *q.tolist()), derivatives or 0.0
+        at, accuracy = [*p.tolist(), *q.tolist()], derivatives or 0.0
+        if self._quick is not None:
+            self._quick.hand_over()
         if at == self._at and self._accuracy <= accuracy:
             return
         self._at = None
@@ -294,11 +349,11 @@ class Plant:
             self.robot.require_reachable(p)  # the plainer reason, if it is the reason
             raise
         drift = self._solver.drift()
-        if not drift <= _LARGEST_DRIFT:
+        if not drift <= LARGEST_DRIFT:
             self._solver.go_back()
             raise ConvergenceError(
                 f"the rods at p = {p} m, q = {q} rad are too taut for this discretisation: their invariant drifts by "
-                f"{drift:.1e} (at most {_LARGEST_DRIFT:.0e}); use more segments or steps",
+                f"{drift:.1e} (at most {LARGEST_DRIFT:.0e}); use more segments or steps",
                 residual=drift,
                 iterations=0,
                 last=None,
@@ -312,25 +367,6 @@ class Plant:
                 rod=unstable[0],
             )
         self._at, self._accuracy = at, accuracy
-
-    def _condensed_mass(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """M and its derivatives at the last pose."""
-        assert self._condensed is not None
-        assert isinstance(self._solver, RodSolver)
-        graph = self._condensed
-        graph.inputs[0][:] = self._solver.state.unknowns
-        graph.inputs[1][:] = q
-        graph()
-        mass, slopes = (read_only(output.copy()) for output in graph.outputs)
-        if not math.isfinite(slopes.sum()):
-            raise ConvergenceError(
-                f"the inertia of the rods at q = {q} rad has no finite derivative: a rod is straight and pushed; "
-                "keep away from this pose",
-                residual=math.nan,
-                iterations=0,
-                last=graph.inputs[0].copy(),
-            )
-        return mass, slopes
 
 
 __all__ = ["INTEGRATORS", "ON_SNAP", "Plant"]

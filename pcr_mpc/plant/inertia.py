@@ -24,7 +24,6 @@ import numpy as np
 from scipy.special import roots_jacobi
 
 from .elastica import elliptic
-from .robot import Robot
 
 INERTIAS = ("none", "constant", "condensed", "full")
 # Points along a rod, beside the tip: 1e-5 of its inertia (1e-3 of the smallest entries) where rods are bent like those
@@ -171,29 +170,3 @@ def _upper(matrix: Any) -> Any:
 
 def _symmetric(m: Any) -> Any:
     return ca.vertcat(ca.horzcat(m[0], m[1], m[3]), ca.horzcat(m[1], m[2], m[4]), ca.horzcat(m[3], m[4], m[5]))
-
-
-@lru_cache(maxsize=16)
-def robot_mass(robot: Robot) -> Any:
-    """Graph of the condensed mass matrix of a robot.
-
-    Returns
-    -------
-    casadi.Function
-        (unknowns (3, n) of the closed form, q (n)) -> M (2 + n, 2 + n) in [kg, kg m, kg m^2] for
-        w = [v, q'], and d vec(M) / d(p, q), shape ((2 + n)^2, 2 + n).
-    """
-    n = robot.n_rods
-    unknowns, q = ca.SX.sym("unknowns", 3, n), ca.SX.sym("q", n)
-    mass, slopes = ca.SX(2 + n, 2 + n), ca.SX((2 + n) ** 2, 2 + n)
-    mass[0, 0] = mass[1, 1] = robot.tip_mass
-    for i, rod in enumerate(robot.rods):
-        rod_matrix, rod_slopes = rod_mass()(unknowns[:, i], q[i])
-        units = ca.DM([1.0, 1.0, rod.length])
-        scale = rod.line_density * rod.length * units @ units.T
-        rod_slopes = ca.diag(ca.vec(scale)) @ rod_slopes @ ca.diag(ca.DM([1 / rod.length, 1 / rod.length, 1.0]))
-        own = [0, 1, 2 + i]
-        places = [row + (2 + n) * column for column in own for row in own]
-        mass[own, own] += scale * rod_matrix
-        slopes[places, own] += rod_slopes
-    return ca.Function("robot_mass", [unknowns, q], [ca.densify(mass), ca.densify(slopes)], {"cse": True})

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 # Each gains four digits or more.
 _ITERATIONS = 3
+# Where the next stage of RK4 is, and how much this one counts, in steps.
+RK4_STAGES = ((1 / 2, 1 / 6), (1 / 2, 1 / 3), (1.0, 1 / 3), (0.0, 1 / 6))
 
 
 class _Symbols:
@@ -67,13 +69,15 @@ class _Symbols:
 
 
 @lru_cache
-def _stop(n: int) -> Any:
+def stop_graph(n: int) -> Any:
+    """Build (known, momentum) -> v."""
     s, momentum = _Symbols(n), ca.SX.sym("pi", 2)
     return s.function("stop", [momentum], [s.at_rest(momentum)])
 
 
 @lru_cache
-def _euler(n: int) -> Any:
+def euler_graph(n: int) -> Any:
+    """Build (known, x) -> p, q, momentum: a step of symplectic Euler."""
     s, x = _Symbols(n), ca.SX.sym("x", 4 + n)
     start = s.mass[:2, :2] @ x[2:4]
     v = s.velocity(start)
@@ -85,7 +89,8 @@ def _euler(n: int) -> Any:
 
 
 @lru_cache
-def _first_half(n: int) -> Any:
+def first_half_graph(n: int) -> Any:
+    """Build (known, x) -> p, q, momentum before the second kick."""
     s, x = _Symbols(n), ca.SX.sym("x", 4 + n)
     start, half = s.mass[:2, :2] @ x[2:4], s.dt / 2
     v = s.velocity(start)
@@ -100,7 +105,8 @@ def _first_half(n: int) -> Any:
 
 
 @lru_cache
-def _second_half(n: int) -> Any:
+def second_half_graph(n: int) -> Any:
+    """Build (known, momentum) -> v at the end."""
     s, momentum = _Symbols(n), ca.SX.sym("pi", 2)
     v = s.velocity(momentum)
     after = momentum + s.dt / 2 * (s.force + s.coriolis(v) - s.drag * v)
@@ -108,8 +114,8 @@ def _second_half(n: int) -> Any:
 
 
 @lru_cache
-def _stage(n: int) -> Any:
-    """Build (y, start, sum, [ahead, weight]) -> start + ahead y', sum + weight y' with y = [p, pi, q]."""
+def stage_graph(n: int) -> Any:
+    """Build (known, y, start, sum, [ahead, weight]) -> start + ahead y', sum + weight y' with y = [p, pi, q]."""
     s, (y, start, total) = _Symbols(n), (ca.SX.sym(name, 4 + n) for name in ("y", "start", "sum"))
     factors = ca.SX.sym("factors", 2)
     v = s.velocity(y[2:4])
@@ -147,7 +153,7 @@ class SemiImplicitEuler:
     """
 
     def __init__(self, n: int) -> None:
-        self._step, self._stop = _Graph(_euler(n)), _Graph(_stop(n))
+        self._step, self._stop = _Graph(euler_graph(n)), _Graph(stop_graph(n))
 
     def __call__(self, plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         """Advance by one step."""
@@ -170,7 +176,7 @@ class VelocityVerlet:
     """
 
     def __init__(self, n: int) -> None:
-        self._first, self._second = _Graph(_first_half(n)), _Graph(_second_half(n))
+        self._first, self._second = _Graph(first_half_graph(n)), _Graph(second_half_graph(n))
 
     def __call__(self, plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         """Advance by one step."""
@@ -188,7 +194,7 @@ class RK4:
     """The classical scheme on [p, pi, q]; fourth order, four forces a step."""
 
     def __init__(self, n: int) -> None:
-        self._stage, self._stop = _Graph(_stage(n)), _Graph(_stop(n))
+        self._stage, self._stop = _Graph(stage_graph(n)), _Graph(stop_graph(n))
 
     def __call__(self, plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         """Advance by one step."""
@@ -198,9 +204,9 @@ class RK4:
         y[:] = x
         y[2:4] = plant.mass(x[:2], x[4:])[0][:2, :2] @ x[2:4]
         start[:] = total[:] = y
-        for fraction, weight in ((dt / 2, dt / 6), (dt / 2, dt / 3), (dt, dt / 3), (0.0, dt / 6)):
+        for fraction, weight in RK4_STAGES:
             stage.load(plant, y[:2], y[4:], rate, f_ext)
-            factors[:] = fraction, weight
+            factors[:] = dt * fraction, dt * weight
             stage()
             y[:], total[:] = ahead, done
         end = total.copy()

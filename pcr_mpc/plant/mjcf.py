@@ -6,9 +6,8 @@ import numpy as np
 
 from ..errors import ModelError
 from .equilibrium import Equilibrium
-from .hinge_chain import ChainState, settled_chains
+from .hinge_chain import ChainState, Hinges, hinges, settled_chains
 from .robot import Robot, Rod
-from .rod_physics import require_plain
 
 # A pin is a soft constraint: a critically damped spring of this time constant [s] and of MuJoCo's largest impedance,
 # stiff enough for a gap of less than a micrometre, and implicit in the integrator, so that no time step is too long.
@@ -23,8 +22,13 @@ def checked_links(robot: Robot, links: int) -> int:
     """Return the number of links, or say what keeps the robot from being chains of so many."""
     if isinstance(links, bool) or not isinstance(links, int | np.integer) or not 2 <= links <= _MOST_LINKS:
         raise ValueError(f"links = {links!r} must be a whole number from 2 to {_MOST_LINKS}")
-    require_plain(robot, "the model for MuJoCo")
     for i, rod in enumerate(robot.rods):
+        if rod.stretches:
+            raise ModelError(
+                f"{robot.name}: rod {i} stretches, but the links of the model for MuJoCo are rigid; "
+                "leave out its axial_stiffness",
+                key="axial_stiffness",
+            )
         if rod.line_density == 0.0:
             raise ModelError(
                 f"{robot.name}: rod {i} has line_density 0 kg/m, but MuJoCo has no bodies without mass; "
@@ -39,15 +43,15 @@ def mjcf(
 ) -> str:
     """Write the robot as MJCF.
 
-    The plane is horizontal, without gravity and contacts. A link is a body with a hinge at its base; the first hinge's
-    coordinate is the first link's angle from world x. The motor is a position servo on it, whose gain is the stiffness
-    of half a link: ``ctrl`` is the motor angle, exactly, for the clamp has no inertia. The tip has the coordinates of
-    two sliders, after those of the hinges.
+    The plane is MuJoCo's x and y, with the robot's gravity and without contacts. A link is a body with a hinge at its
+    base; the first hinge's coordinate is the first link's angle from world x. The motor is a position servo on it,
+    whose gain is the stiffness of half a link: ``ctrl`` is the motor angle, exactly, for the clamp has no inertia; to
+    it the servo adds the hinge's angle at rest. The tip has the coordinates of two sliders, after those of the hinges.
 
     Parameters
     ----------
     robot : Robot
-        Its rods must have mass.
+        Its rods must have mass and not stretch.
     pose : Equilibrium, optional
         Writes a keyframe "start": the chains in equilibrium there, at rest.
     links : int
@@ -64,7 +68,7 @@ def mjcf(
     Raises
     ------
     ModelError
-        A rod has no mass.
+        A rod has no mass, or stretches.
     ConvergenceError
         The chains have no equilibrium near the pose.
 
@@ -74,14 +78,16 @@ def mjcf(
     links of the default robot blow up at steps of 25 us.
     """
     links = checked_links(robot, links)
+    chains = hinges(robot, links)
     lines = [
         f'<mujoco model="{_quoted(robot.name)}">',
         '  <compiler angle="radian"/>',
-        f'  <option integrator="discrete" timestep="{_numbers(timestep)}" gravity="0 0 0" tolerance="1e-14">',
+        f'  <option integrator="discrete" timestep="{_numbers(timestep)}" '
+        f'gravity="{_numbers(*robot.gravity)} 0" tolerance="1e-14">',
         '    <flag contact="disable" autoreset="disable"/>',
         "  </option>",
         "  <worldbody>",
-        *(line for i, rod in enumerate(robot.rods) for line in _chain(i, rod, links, visible)),
+        *(line for i, rod in enumerate(robot.rods) for line in _chain(i, rod, chains[i], visible)),
         '    <body name="tip">',
         f'      <joint name="x" type="slide" axis="1 0 0" damping="{_numbers(robot.drag)}"/>',
         f'      <joint name="y" type="slide" axis="0 1 0" damping="{_numbers(robot.drag)}"/>',
@@ -98,9 +104,12 @@ def mjcf(
             f'solimp="{_PIN_IMPEDANCE} {_PIN_IMPEDANCE} 1"/>'
         )
     lines += ["  </equality>", "  <actuator>"]
-    for i, rod in enumerate(robot.rods):
-        gain = 2.0 * links * rod.bending_stiffness / rod.length
-        lines.append(f'    <position name="motor{i}" joint="rod{i}_0" kp="{_numbers(gain)}"/>')
+    for i, chain in enumerate(chains):
+        gain, rest = chain.stiffness[0], chain.rest[0]
+        lines.append(
+            f'    <general name="motor{i}" joint="rod{i}_0" biastype="affine" gainprm="{_numbers(gain)}" '
+            f'biasprm="{_numbers(gain * rest, -gain, 0.0)}"/>'
+        )
     lines.append("  </actuator>")
     if pose is not None:
         start, still = settled_chains(pose, np.zeros(2), links), np.zeros(2)
@@ -122,10 +131,11 @@ def coordinates(state: ChainState, p: np.ndarray, v: np.ndarray) -> tuple[np.nda
 _GHOST = 'mass="0" contype="0" conaffinity="0"'
 
 
-def _chain(i: int, rod: Rod, links: int, visible: bool) -> list[str]:
+def _chain(i: int, rod: Rod, chain: Hinges, visible: bool) -> list[str]:
     """The bodies of rod i, one inside the other."""
+    links = len(chain.rest)
     length = rod.length / links
-    mass, stiffness = rod.line_density * length, links * rod.bending_stiffness / rod.length
+    mass = rod.line_density * length
     across = mass * length**2 / 12
     inertial = (
         f'<inertial pos="{_numbers(length / 2)} 0 0" mass="{_numbers(mass)}" '
@@ -134,10 +144,12 @@ def _chain(i: int, rod: Rod, links: int, visible: bool) -> list[str]:
     shape = f'<geom type="capsule" fromto="0 0 0 {_numbers(length)} 0 0" size="{_numbers(rod.length / 200)}" {_GHOST}/>'
     lines = []
     for j in range(links):
-        at, spring = (rod.base, 0.0) if j == 0 else ((length, 0.0), stiffness)
+        # The first spring is the motor's servo.
+        at, spring, rest = (rod.base, 0.0, 0.0) if j == 0 else ((length, 0.0), chain.stiffness[j], chain.rest[j])
         lines += [
             f'<body name="rod{i}_{j}" pos="{_numbers(*at)} 0">',
-            f'<joint name="rod{i}_{j}" type="hinge" axis="0 0 1" stiffness="{_numbers(spring)}"/>',
+            f'<joint name="rod{i}_{j}" type="hinge" axis="0 0 1" stiffness="{_numbers(spring)}" '
+            f'springref="{_numbers(rest)}"/>',
             inertial,
         ]
         if visible:

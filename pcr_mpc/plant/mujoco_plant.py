@@ -23,7 +23,7 @@ class MuJoCoPlant:
     Parameters
     ----------
     robot : Robot
-        Its rods must have mass.
+        Its rods must have mass and not stretch.
     links : int
         Per rod. The error falls as their square: within a second of free motion of the default robot 1.8 mm at 20
         links, 0.44 mm at 40, 0.11 mm at 80.

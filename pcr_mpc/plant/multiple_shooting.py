@@ -95,35 +95,13 @@ def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = N
     weights = ca.vertcat(1, 1 / load, 1 / load, 1 / ca.sqrt(load))
     norm = ca.norm_2(ca.vertcat(*(weights * gap for gap in gaps), position, weights[3] * moment))
 
-    transition, gap = [], []
-    for j, (end, node) in enumerate(zip(ends, z, strict=True)):
-        jacobian = ca.jacobian(end[:6], node)  # of dx, dy and the state at the end
-        transition.append(ca.horzcat(ca.vertcat(ca.SX.eye(2), ca.SX(4, 2)), jacobian))
-        gap.append(ca.vertcat(0, 0, gaps[j] if j < n - 1 else ca.SX(4, 1)))
-
-    conditions = ca.vertcat(ca.SX.eye(6)[:2, :], ca.SX.eye(6)[5, :])
-    t, r = [conditions], [-ca.vertcat(position, moment)]
-    conjugate_points, crossed = ca.SX(0), ca.SX(0)
-    for j in range(n - 1, -1, -1):
-        rows, rhs = _orthonormal_rows(t[0] @ transition[j], r[0] - t[0] @ gap[j])
-        t.insert(0, rows)
-        r.insert(0, rhs)
-        negative = _determinant3(rows[:, 3:]) < -_DETERMINANT_ROUNDING
-        conjugate_points += negative != crossed
-        crossed = negative
-
-    # Forward: column 0 is the Newton step; the others start from a moved or turned base. Moving the tip
-    # is moving the base the other way, so the tangent with respect to d has the opposite sign.
-    base = ca.horzcat(ca.SX(3, 1), -ca.SX.eye(3)[:, :2], ca.SX.eye(3)[:, 2])
+    sweep = Sweep(ends, z)
+    # Column 0 is the Newton step; the others start from a moved or turned base.
     first = ca.DM([[1, 0, 0, 0]])
-    base_loads = _solve3(t[0][:, 3:], r[0] @ first - t[0][:, :3] @ base)
-    change = ca.vertcat(base, base_loads)
-    blocks = [change[2:, :]]
-    for j in range(n - 1):
-        change = transition[j] @ change + gap[j] @ first
-        change -= t[j + 1].T @ (t[j + 1] @ change - r[j + 1] @ first)
-        blocks.append(change[2:, :])
-    moves = ca.vertcat(*blocks)
+    steps_at_nodes = [ca.vertcat(0, 0, gap) @ first for gap in gaps]
+    changes = sweep.solve(ca.horzcat(ca.SX(3, 1), moved_base()), -ca.vertcat(position, moment) @ first, steps_at_nodes)
+    base_loads = changes[0][3:, :]
+    moves = ca.vertcat(*(change[2:, :] for change in changes))
 
     energy = sum(end[6] for end in ends)
     if layout is None:
@@ -134,13 +112,80 @@ def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = N
         drift = invariant(ends[-1][2:6], layout, physics, 1.0) - invariant(z[0], layout, physics, 0.0)
         drift += sum(ca.dot(weight, end[:2]) - end[7] for end in ends)
     length = ca.norm_2(ca.repmat(weights, n, 1) * moves[:, 0])
-    scalars = ca.vertcat(norm, length, energy, conjugate_points, drift / (load + z[0][3] ** 2 / 2))
+    scalars = ca.vertcat(norm, length, energy, sweep.conjugate_points(), drift / (load + z[0][3] ** 2 / 2))
     # The force at the tip is that at the base less the weight in between, which no change of the pose changes.
     loads = ca.vertcat(z[0][1:3] - weight, z[0][3])
     results = [moves[:, 0], moves[:, 1:], loads, base_loads[:, 1:], scalars]
     options = {"cse": True}
     newton = ca.Function("rod_newton", arguments, [ca.densify(r) for r in results], options)
     return newton, ca.Function("rod_residual", arguments, [norm, loads], options)
+
+
+class Sweep:
+    """The linearised equations of one rod, factorised from its tip to its base.
+
+    Parameters
+    ----------
+    ends : list of casadi columns
+        [dx, dy, theta, n_x, n_y, m, ...] at the end of each segment (see `rod.propagation`).
+    starts : list of casadi columns
+        [theta, n_x, n_y, m] at its start, on which the end depends.
+    """
+
+    def __init__(self, ends: list[Any], starts: list[Any]) -> None:
+        self._transitions = [
+            ca.horzcat(ca.vertcat(ca.SX.eye(2), ca.SX(4, 2)), ca.jacobian(end[:6], start))
+            for end, start in zip(ends, starts, strict=True)
+        ]
+        # T of every node and of the tip, and what makes the rows of T_{j+1} Phi_j orthonormal.
+        self._rows: list[Any] = [ca.vertcat(ca.SX.eye(6)[:2, :], ca.SX.eye(6)[5, :])]
+        self._turns: list[Any] = []
+        for transition in reversed(self._transitions):
+            rows, turn = _orthonormal_rows(self._rows[0] @ transition, ca.SX.eye(3))
+            self._rows.insert(0, rows)
+            self._turns.insert(0, turn)
+
+    def solve(self, base: Any, at_tip: Any, gaps: list[Any]) -> list[Any]:
+        """Solve dx_{j+1} = Phi_j dx_j + c_j, T dx = r at the tip, for several right-hand sides at once.
+
+        Parameters
+        ----------
+        base : casadi, shape (3, k)
+            [x, y, theta] at the base.
+        at_tip : casadi, shape (3, k)
+            [x, y, m] at the tip.
+        gaps : list of casadi, shape (6, k)
+            c_j; the last may be left out if it is zero.
+
+        Returns
+        -------
+        list of casadi, shape (6, k)
+            dx at the start of each segment.
+        """
+        right, gaps = [at_tip], gaps + [ca.SX(6, at_tip.size2())] * (len(self._turns) - len(gaps))
+        for row, turn, gap in zip(self._rows[:0:-1], reversed(self._turns), reversed(gaps), strict=True):
+            right.insert(0, turn @ (right[0] - row @ gap))
+        loads = _solve3(self._rows[0][:, 3:], right[0] - self._rows[0][:, :3] @ base)
+        changes = [ca.vertcat(base, loads)]
+        for j in range(len(gaps) - 1):
+            change = self._transitions[j] @ changes[-1] + gaps[j]
+            rows = self._rows[j + 1]
+            changes.append(change - rows.T @ (rows @ change - right[j + 1]))
+        return changes
+
+    def conjugate_points(self) -> Any:
+        """Number of changes of sign along the rod of the part of T that belongs to the loads."""
+        count, crossed = ca.SX(0), ca.SX(0)
+        for rows in self._rows[-2::-1]:
+            negative = _determinant3(rows[:, 3:]) < -_DETERMINANT_ROUNDING
+            count += negative != crossed
+            crossed = negative
+        return count
+
+
+def moved_base() -> Any:
+    """[x, y, theta] of the base, one column for each entry of the pose: moving the tip moves the base the other way."""
+    return ca.diagcat(-1, -1, 1)
 
 
 def invariant(z: Any, layout: Layout | None = None, physics: Any = None, s: float = 0.0) -> Any:
@@ -158,15 +203,18 @@ def invariant(z: Any, layout: Layout | None = None, physics: Any = None, s: floa
 
 
 def _orthonormal_rows(t: Any, r: Any) -> tuple[Any, Any]:
-    """Replace the equations t dx = r (3 x 6) by equivalent ones with orthonormal rows (Gram-Schmidt)."""
+    """Replace the equations t dx = r (3 x 6) by equivalent ones with orthonormal rows (Gram-Schmidt).
+
+    ``r`` may have several columns.
+    """
     rows: list[Any] = []
     for i in range(3):
-        row = ca.horzcat(t[i, :], r[i])
+        row = ca.horzcat(t[i, :], r[i, :])
         for done in rows:
             row -= ca.dot(row[:6], done[:6]) * done
         rows.append(row / ca.norm_2(row[:6]))
     stacked = ca.vertcat(*rows)
-    return stacked[:, :6], stacked[:, 6]
+    return stacked[:, :6], stacked[:, 6:]
 
 
 def _determinant3(m: Any) -> Any:

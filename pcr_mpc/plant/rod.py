@@ -8,6 +8,7 @@ kinds can be compared. Positions keep the orientation of the world frame.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -142,19 +143,34 @@ def propagation(steps: int, scheme: str = "rk4", layout: Layout | None = None) -
         With a layout (z, h, s, physics) -> end (8): the piece begins at s, and its weight's energy is counted from
         there. Within each step the properties are linear: exact if the knots are ends of steps.
     """
-    a, b = SCHEMES[scheme]
     z, h, s = ca.SX.sym("z", 4), ca.SX.sym("h"), ca.SX.sym("s")
     physics = ca.SX.sym("physics", layout.size if layout else 0)
-    state = ca.vertcat(0, 0, z, 0) if layout is None else ca.vertcat(0, 0, z, 0, 0)
+    start = ca.vertcat(0, 0, z, 0) if layout is None else ca.vertcat(0, 0, z, 0, 0)
+    state = runge_kutta(rod_ode, start, h, steps, scheme, layout, s, physics)
+    return ca.Function("propagate", [z, h, s, physics] if layout else [z, h], [state])
+
+
+def runge_kutta(
+    slope: Callable[[Any, _Here | None], Any],
+    state: Any,
+    h: Any,
+    steps: int,
+    scheme: str,
+    layout: Layout | None,
+    s: Any,
+    physics: Any,
+) -> Any:
+    """Integrate ``slope(state, here)`` over h in equal steps from s, with the properties of `propagation`'s rod."""
+    a, b = SCHEMES[scheme]
     step = h / steps
     for j in range(steps):
         along = _along(layout, physics, s + j * step, step, a.sum(axis=1)) if layout else [None] * len(b)
         slopes: list[Any] = []
         for row, here in zip(a, along, strict=True):
             increment = sum((w * k for w, k in zip(row, slopes, strict=False) if w), ca.SX(state.numel(), 1))
-            slopes.append(rod_ode(state + step * increment, here))
+            slopes.append(slope(state + step * increment, here))
         state = state + step * sum(w * k for w, k in zip(b, slopes, strict=True) if w)
-    return ca.Function("propagate", [z, h, s, physics] if layout else [z, h], [state])
+    return state
 
 
 def _along(layout: Layout, physics: Any, s: Any, step: Any, nodes: np.ndarray) -> list[_Here]:

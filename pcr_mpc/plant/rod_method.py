@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from . import elastica, multiple_shooting
+from . import elastica, inertia, multiple_shooting, shooting_inertia
 from .chart import HeldShape
 from .robot import Robot
 from .rod import RodPhysics, aligned_steps, sample_rod
@@ -50,6 +50,8 @@ class RodMethod:
         See `multiple_shooting.rod_newton`.
     retract : casadi.Function
         (unknowns, change) -> unknowns: how a step is taken.
+    chord : casadi.Function or None
+        (unknowns, pose, tangent) -> change: a cheap iteration with derivatives that are there, if there is one.
     tolerance : float
         Residual at which a rod counts as solved: rounding.
     following : float
@@ -62,6 +64,8 @@ class RodMethod:
         (nodes (4, N), physics) -> list of unknowns: starts from an equilibrium or a guess, to be tried in this order.
     to_nodes : callable
         (unknowns, clamp angle, wanted number N) -> nodes (4, N); the shooting methods keep their own number.
+    mass : callable
+        () -> casadi.Function, the condensed inertia of a rod (see `inertia.rod_mass`); built when it is wanted.
     physics : tuple of RodPhysics or None
         Of each rod: the third argument of its graphs. None: plain rods, whose graphs have none.
     """
@@ -70,12 +74,14 @@ class RodMethod:
     newton: Any
     residual: Any
     retract: Any
+    chord: Any
     tolerance: float
     following: float
     branch: slice
     from_shape: Callable[[HeldShape, float], np.ndarray]
     from_nodes: Callable[[np.ndarray, RodPhysics | None], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
+    mass: Callable[[], Any]
     physics: tuple[RodPhysics, ...] | None = None
 
     def physics_of(self, rod: int) -> RodPhysics | None:
@@ -101,6 +107,7 @@ def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
         newton=newton,
         residual=residual,
         retract=ca.Function("retraction", [start, change], [start + change]),
+        chord=None,
         # Relative to the load; on taut rods the equations have a condition of 1e8.
         tolerance=1e-10,
         following=1e-10,
@@ -108,6 +115,7 @@ def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
         to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
+        mass=lambda: shooting_inertia.rod_mass(n, steps, shooting.scheme, layout),
         physics=physics,
     )
 
@@ -121,12 +129,14 @@ def closed_form_method() -> RodMethod:
         newton=newton,
         residual=residual,
         retract=elastica.retraction(),
+        chord=elastica.rod_chord(),
         tolerance=1e-13,
         following=1e-11,
         branch=slice(0, 3),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=lambda nodes, _: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
         to_nodes=elastica.nodes,
+        mass=inertia.rod_mass,
     )
 
 
@@ -134,7 +144,9 @@ def closed_form_method() -> RodMethod:
 def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     """Tangent predictor, a fixed number of Newton iterations and the verdict, for the whole robot in one graph.
 
-    Nothing is decided in here: the caller reads the verdict, and keeps the result or takes the slow way.
+    Nothing is decided in here: the caller reads the verdict, and keeps the result or takes the slow way. After a
+    single iteration comes one with the same derivatives, where the method has that: without it, every other step of a
+    brisk motion misses the tolerance by a digit, and costs a second iteration.
 
     Returns
     -------
@@ -166,6 +178,8 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
         for _ in range(iterations):
             step, tangent, _, load_tangent, scalars = method.newton(u, pose, *known)
             u = method.retract(u, step)
+        if iterations == 1 and method.chord is not None:
+            u = method.retract(u, method.chord(u, pose, tangent))
         residual, loads = method.residual(u, pose, *known)
         for name, value in zip(columns, (u, tangent, pose, loads, load_tangent, scalars), strict=True):
             columns[name].append(value)
@@ -183,5 +197,10 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     record = ca.vertcat(*(ca.vec(ca.horzcat(*found)) for found in columns.values()))
     result = ca.vertcat(force, ca.vec(k), ca.vec(ca.horzcat(*g)))
     function = ca.Function("warm_step", [target, start_record], [record, verdict, result])
-    small = method.newton.n_instructions() <= _INLINED_INSTRUCTIONS
-    return function.expand("warm_step", {"cse": True}) if small else function
+    return inlined(function, method.newton)
+
+
+def inlined(function: Any, of_rod: Any) -> Any:
+    """Inline the graph of a rod into that of a robot that calls it, if it is small."""
+    small = of_rod.n_instructions() <= _INLINED_INSTRUCTIONS
+    return function.expand(function.name(), {"cse": True}) if small else function

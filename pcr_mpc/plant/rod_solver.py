@@ -17,7 +17,8 @@ from .rod_method import RodMethod, warm_step
 from .rod_physics import require_plain
 from .rod_state import RobotState, RodState
 
-_ROUGH = 1e-4
+# Residual beyond which another iteration is not worth trying.
+ROUGH = 1e-4
 _MOST_SNAPS = 4  # of one rod in one move
 
 
@@ -145,7 +146,7 @@ class RodSolver:
     def _move_warm(self, state: RobotState, p: np.ndarray, q: np.ndarray, derivatives: float | None) -> bool:
         """Climb the first rung; a second time from where the first led if that was close but not enough."""
         # Where rough derivatives will do, one Newton iteration usually does.
-        rough = derivatives is not None and derivatives >= _ROUGH
+        rough = derivatives is not None and derivatives >= ROUGH
         solved = self.method.tolerance if derivatives is None else self.method.following
         source, changed, iterations = state.start, 0.0, 0
         for warm in (self._warm[0 if rough else 1], self._warm[0]):
@@ -156,13 +157,10 @@ class RodSolver:
             changed += change
             iterations += 1 if warm is self._warm[0] else 2
             # Written so that NaN is a failure.
-            if not (residual <= _ROUGH and changed <= BRANCH_CHANGE and not conjugate_points):
+            if not (residual <= ROUGH and changed <= BRANCH_CHANGE and not conjugate_points):
                 return False
             if residual <= solved and at_derivatives <= (solved if derivatives is None else derivatives):
-                # Into the spare one: the last state stays whole for a caller who goes back to it.
-                assert self._spare is not None
-                self._spare.take(warm.outputs, drift, residual, iterations)
-                self._state, self._spare = self._spare, state
+                self.adopt(warm.outputs[0], warm.outputs[2], drift=drift, residual=residual, iterations=iterations)
                 return True
             source = warm.outputs[0][: len(source)]
         return False
@@ -190,6 +188,15 @@ class RodSolver:
                 snaps.append(Snap(i, (x, y), float(fallen.pose[2]), lost))
                 start = fallen
         raise NotConverged(start.residual, start.iterations, start.unknowns, f"snapped {_MOST_SNAPS} times in a row")
+
+    def adopt(
+        self, record: np.ndarray, result: np.ndarray, *, drift: float, residual: float, iterations: int = 1
+    ) -> None:
+        """Take over a pose that a graph has solved, as `warm_step` describes it."""
+        # Into the spare one: the last state stays whole for a caller who goes back to it.
+        assert self._spare is not None
+        self._spare.take(record, result, drift, residual, iterations)
+        self._state, self._spare = self._spare, self._state
 
     def go_back(self) -> None:
         """Undo the last `move`."""

@@ -73,10 +73,10 @@ class RobotState:
         self.force = result[:2]
         self.k, self.g = result[2:6].reshape(2, 2, order="F"), result[6:].reshape(2, -1, order="F")
 
-    def take(self, outputs: list[np.ndarray], drift: float, residual: float, iterations: int) -> None:
+    def take(self, record: np.ndarray, result: np.ndarray, drift: float, residual: float, iterations: int) -> None:
         """Copy the results of `warm_step`, which found no conjugate point."""
-        self._record[:] = outputs[0]
-        self._keep(outputs[2].copy())
+        self._record[:] = record
+        self._keep(result.copy())
         self.residual, self.drift = residual, drift
         self.iterations = iterations
         self.rung = "warm"

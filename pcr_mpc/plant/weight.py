@@ -34,7 +34,7 @@ class CondensedWeight:
     """
 
     def __init__(self, robot: Robot) -> None:
-        first, second = _robot_weight(robot)
+        first, second = robot_weight(robot)
         self._first, self._second = BufferedFunction(first), BufferedFunction(second)
 
     def first(self, unknowns: np.ndarray, q: np.ndarray) -> tuple[float, np.ndarray]:
@@ -97,7 +97,8 @@ def _rod_weight() -> tuple[Any, Any]:
 
 
 @lru_cache(maxsize=16)
-def _robot_weight(robot: Robot) -> tuple[Any, Any]:
+def robot_weight(robot: Robot) -> tuple[Any, Any]:
+    """Graphs of a robot: (unknowns (3, n), q (n)) -> U_g [J] and dU_g/d(p, q) (2 + n); and its second derivatives."""
     n = robot.n_rods
     unknowns, q = ca.SX.sym("unknowns", 3, n), ca.SX.sym("q", n)
     energy, slope, curvature = ca.SX(1, 1), ca.SX(2 + n, 1), ca.SX(2 + n, 2 + n)

@@ -1,0 +1,197 @@
+"""Open-loop motion of one robot or of many, without Python between the steps."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ..buffered import BufferedFunction
+from ..errors import PCRError, checked_array
+from ..frozen import freeze
+from .dynamics import Plant
+from .equilibrium import Equilibrium
+from .step_graph import CORRECTIONS, StepModel, limits, step_function
+
+# Steps in one call: more of them make nothing faster.
+_STEPS = 1000
+# Robots times steps in one call: a few hundred bytes each, which stay.
+_MOST_STEPS = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Motion of one robot, or of R robots: then every array has an axis of R in front.
+
+    Attributes
+    ----------
+    t : ndarray, shape (T + 1,)
+        [s]; one for all.
+    x : ndarray, shape (T + 1, 4 + n)
+        States, the start first.
+    residual : ndarray, shape (T,)
+        Of the statics at the end of each step, added up over the rods [rod lengths, or as the method has it].
+    stepped : tuple of int
+        Robots (0 where there is one) whose rods two Newton iterations a step did not bring along, so that `Plant.step`
+        moved them, from the start.
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    residual: np.ndarray
+    stepped: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def rollout(
+    plant: Plant,
+    x0: Any,
+    inputs: Any,
+    f_ext: Any = (0.0, 0.0),
+    *,
+    guess: Equilibrium | None = None,
+    threads: int = 1,
+) -> Rollout:
+    """Move robots through sequences of inputs that are known in advance, up to a thousand steps in one call.
+
+    The result is that of `Plant.step` from ``plant.reset(x0, guess)`` on, to the tolerance of the statics; errors are
+    those of `Plant.step`, too. The plant is used for that, and afterwards is wherever that left it.
+
+    Parameters
+    ----------
+    plant : Plant
+        Robot, method, integrator and dt; not by single shooting, and not with inertia "full".
+    x0 : array_like, shape (4 + n,) or (R, 4 + n)
+        State at the start [m, m/s, rad], one for all robots or one each.
+    inputs : array_like, shape (T, n) or (R, T, n)
+        Motor rates, held over a step [rad/s], for all or for each.
+    f_ext : array_like, shape (2,), (T, 2) or (R, T, 2)
+        External force on the tips besides their weight [N].
+    guess : Equilibrium, optional
+        On whose branch the rods start; None: on that of least energy.
+    threads : int
+        Of the machine to work in; robots are shared out among them.
+
+    Raises
+    ------
+    UnreachableError, ConvergenceError, UnstableError
+        The rods of a robot could not follow; the exception carries which ``robot``, at which ``step``, and its
+        ``state`` at the start of that.
+    ValueError
+        A plant that has no such graph, or an argument that is not finite or of the wrong shape.
+    """
+    model = plant.step_model
+    if model is None:
+        raise ValueError(f"method {plant.method!r} with inertia {plant.inertia!r} has no rollout; use Plant.step")
+    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
+        raise ValueError(f"threads is {threads!r}, expected a whole number of at least 1")
+    starts, inputs, f_ext, many = _checked(plant, x0, inputs, f_ext)
+    robots, steps = inputs.shape[:2]
+    x, residual = np.empty((robots, steps + 1, plant.n_states)), np.empty((robots, steps))
+    memories = _memories(plant, starts, guess)
+    at_once = max(1, _MOST_STEPS // min(steps, _STEPS))
+    done = np.zeros(robots, dtype=bool)
+    for corrections in CORRECTIONS:
+        left = np.flatnonzero(~done)
+        for first in range(0, len(left), at_once):
+            some = left[first : first + at_once]
+            given = np.concatenate([inputs[some], f_ext[some]], axis=2)
+            settings = corrections, plant.compiled, threads
+            x[some], residual[some], done[some] = _moved(model, settings, memories[some], starts[some], given)
+    stepped = np.flatnonzero(~done).tolist()
+    for i in stepped:
+        x[i], residual[i] = _stepped(plant, i, starts[i], inputs[i], f_ext[i], guess)
+    t = plant.dt * np.arange(steps + 1)
+    return Rollout(t, x if many else x[0], residual if many else residual[0], tuple(stepped))
+
+
+def _checked(plant: Plant, x0: Any, inputs: Any, f_ext: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Arguments with all their axes, and whether there is one of robots."""
+    x0, inputs, f_ext = np.asarray(x0), np.asarray(inputs), np.asarray(f_ext)
+    n, many = plant.robot.n_rods, x0.ndim == 2 or inputs.ndim == 3 or f_ext.ndim == 3
+    steps = inputs.shape[-2] if inputs.ndim in (2, 3) else 1
+    robots = next((a.shape[0] for a, ndim in ((x0, 2), (inputs, 3), (f_ext, 3)) if a.ndim == ndim), 1)
+    if not steps or not robots:
+        raise ValueError(f"inputs has shape {inputs.shape}, expected at least one step and one robot")
+    x0 = checked_array("x0", x0, (*((robots,) if x0.ndim == 2 else ()), plant.n_states))
+    inputs = checked_array("inputs", inputs, (*((robots,) if inputs.ndim == 3 else ()), steps, n))
+    lead = {2: (steps,), 3: (robots, steps)}.get(f_ext.ndim, ())
+    f_ext = checked_array("f_ext", f_ext, (*lead, 2))
+    return (
+        np.broadcast_to(x0, (robots, plant.n_states)),
+        np.broadcast_to(inputs, (robots, steps, n)),
+        np.broadcast_to(f_ext, (robots, steps, 2)),
+        many,
+    )
+
+
+def _memories(plant: Plant, starts: np.ndarray, guess: Equilibrium | None) -> np.ndarray:
+    """What the graphs start from; robots that start alike share it."""
+    found: dict[bytes, np.ndarray] = {}
+    for x in starts:
+        if x.tobytes() not in found:
+            plant.reset(x, guess)
+            found[x.tobytes()] = plant.memory(x)
+    return np.stack([found[x.tobytes()] for x in starts])
+
+
+def _moved(
+    model: StepModel,
+    settings: tuple[int, bool, int],
+    memories: np.ndarray,
+    starts: np.ndarray,
+    given: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States, residuals, and which robots kept to their branch all the way."""
+    robots, steps = given.shape[:2]
+    x, verdicts = np.empty((robots, steps + 1, starts.shape[1])), np.empty((robots, steps, 5))
+    x[:, 0] = starts
+    for first in range(0, steps, _STEPS):
+        block = slice(first, min(steps, first + _STEPS))
+        length = block.stop - first
+        graph = _many_steps(model, length, robots, *settings, threading.get_ident())
+        # CasADi puts robots and steps side by side, column by column: rows of these views.
+        memory, start, told = (place.T.reshape(robots, -1) for place in graph.inputs)
+        results = [place.T.reshape(robots, length, -1) for place in graph.outputs]
+        memory[:], start[:], told[:] = memories, x[:, first], given[:, block].reshape(robots, -1)
+        graph()
+        memories = results[0][:, -1].copy()
+        x[:, first + 1 : block.stop + 1], verdicts[:, block] = results[1:]
+    good = np.all(verdicts <= limits(model), axis=(1, 2)) & np.isfinite(x).all(axis=(1, 2))
+    return x, verdicts[:, :, 0], np.asarray(good)
+
+
+@lru_cache(maxsize=8)
+def _many_steps(
+    model: StepModel, steps: int, robots: int, corrections: int, compiled: bool, threads: int, caller: int
+) -> BufferedFunction:
+    """One graph for each thread of the caller's: its buffers are shared memory."""
+    step = step_function(model, corrections, details=False, compiled=compiled)
+    graph = step.mapaccum("steps", steps, 2, {})
+    if robots > 1:
+        graph = graph.map(robots, "thread", threads) if threads > 1 else graph.map(robots, "serial")
+    return BufferedFunction(graph)
+
+
+def _stepped(
+    plant: Plant, robot: int, start: np.ndarray, inputs: np.ndarray, f_ext: np.ndarray, guess: Equilibrium | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """States and residuals of one robot by `Plant.step`."""
+    x, residual = np.empty((len(inputs) + 1, len(start))), np.empty(len(inputs))
+    x[0] = start
+    step = 0
+    try:
+        plant.reset(start, guess)
+        for step in range(len(inputs)):
+            x[step + 1] = plant.step(x[step], inputs[step], f_ext[step])
+            residual[step] = plant.residual
+    except PCRError as error:
+        error.details |= {"robot": robot, "step": step}
+        error.add_note(f"robot {robot}, step {step}, t = {step * plant.dt:.6g} s of a rollout")
+        raise
+    return x, residual

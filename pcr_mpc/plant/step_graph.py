@@ -1,0 +1,195 @@
+"""A whole time step of the plant as one graph: what `Plant.step` tries first, and what `rollout` repeats.
+
+It is put together from the graphs that the slow way calls one by one (see `integrators`, `warm_step`, `robot_mass`):
+the same arithmetic, without Python in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ..compiled import compiled as machine_code
+from .integrators import RK4_STAGES, euler_graph, first_half_graph, second_half_graph, stage_graph, stop_graph
+from .mass_matrix import robot_mass
+from .robot import Robot
+from .rod_follower import BRANCH_CHANGE
+from .rod_method import RodMethod, warm_step
+from .weight import robot_weight
+
+# Newton iterations for a force, to be tried in this order.
+CORRECTIONS = (1, 2)
+# A simulation uses the derivatives only to predict the next pose.
+PREDICTOR_ACCURACY = 1e-2
+# Relative drift of a rod's invariant beyond which its force may be off by per cents.
+LARGEST_DRIFT = 1e-3
+
+
+@dataclass(frozen=True)
+class StepModel:
+    """What a step is a step of.
+
+    Attributes
+    ----------
+    robot : Robot
+    rods : Robot
+        The same with the gravity under which its rods bend.
+    method : RodMethod
+        Of ``rods``.
+    integrator : {"semi_implicit_euler", "velocity_verlet", "rk4"}
+    inertia : {"none", "constant", "condensed"}
+    weighed : bool
+        Whether the rods' weight is condensed.
+    dt : float
+        [s].
+    """
+
+    robot: Robot
+    rods: Robot
+    method: RodMethod
+    integrator: str
+    inertia: str
+    weighed: bool
+    dt: float
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """Numbers of a memory: what starts the rods, F, and M with its derivatives as far as they are not fixed."""
+        n = self.robot.n_rods
+        mass = {"none": 0, "constant": (2 + n) ** 2, "condensed": (2 + n) ** 2 * (3 + n)}[self.inertia]
+        return (4 * self.method.newton.size1_in(0) + 3) * n, 2, mass
+
+    def memory(self, start: np.ndarray, force: np.ndarray, mass: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Put a memory together."""
+        kept = {"none": (), "constant": mass[:1], "condensed": mass}[self.inertia]
+        return np.concatenate([start, force, *(matrix.ravel(order="F") for matrix in kept)])
+
+
+class _Motion:
+    """Rods and mass on their way through a step, as expressions."""
+
+    def __init__(self, model: StepModel, memory: Any, rates: Any, push: Any, corrections: int) -> None:
+        self.model, self.n = model, model.robot.n_rods
+        self._push = push
+        self._rates, self._corrections = rates, corrections
+        start, force, mass = model.widths
+        self.start, self.force, mass = ca.vertsplit(memory, [0, start, start + force, start + force + mass])
+        size = 2 + self.n
+        self._mass: tuple[Any, Any]
+        if model.inertia == "none":
+            tip = np.zeros((size, size))
+            tip[0, 0] = tip[1, 1] = model.robot.tip_mass
+            self._mass = ca.DM(tip), ca.DM.zeros(size**2, size)
+        elif model.inertia == "constant":
+            self._mass = ca.reshape(mass, size, size), ca.DM.zeros(size**2, size)
+        else:
+            self._mass = ca.reshape(mass[: size**2], size, size), ca.reshape(mass[size**2 :], size**2, size)
+        self.verdict: Any = 0
+        self.record: Any = None
+        self.result: Any = None
+
+    def known(self) -> list[Any]:
+        """First arguments of the graphs of `integrators`."""
+        robot = self.model.robot
+        return [*self._mass, self._push - self.force, self._rates, ca.DM([robot.drag, self.model.dt])]
+
+    def move(self, p: Any, q: Any) -> None:
+        """Let the rods follow to (p, q)."""
+        model = self.model
+        warm = warm_step(model.rods, model.method, self._corrections)
+        self.record, verdict, self.result = warm(ca.vertcat(p, q), self.start)
+        self.verdict += verdict
+        self.start, self.force = self.record[: model.widths[0]], self.result[:2]
+        unknowns = ca.reshape(self.record[: model.method.newton.size1_in(0) * self.n], -1, self.n)
+        if model.weighed:
+            self.force += robot_weight(model.robot)[0](unknowns, q)[1][:2]
+        if model.inertia == "condensed":
+            self._mass = tuple(robot_mass(model.robot, model.method)(unknowns, q))
+
+    def memory(self) -> Any:
+        """What the next step starts from."""
+        kept = {"none": (), "constant": self._mass[:1], "condensed": self._mass}[self.model.inertia]
+        return ca.vertcat(self.start, self.force, *(ca.vec(matrix) for matrix in kept))
+
+
+def _semi_implicit_euler(motion: _Motion, x: Any) -> Any:
+    p, q, momentum = euler_graph(motion.n)(*motion.known(), x)
+    motion.move(p, q)
+    return ca.vertcat(p, stop_graph(motion.n)(*motion.known(), momentum), q)
+
+
+def _velocity_verlet(motion: _Motion, x: Any) -> Any:
+    p, q, momentum = first_half_graph(motion.n)(*motion.known(), x)
+    motion.move(p, q)
+    return ca.vertcat(p, second_half_graph(motion.n)(*motion.known(), momentum), q)
+
+
+def _rk4(motion: _Motion, x: Any) -> Any:
+    mass = motion.known()[0]
+    y = start = total = ca.vertcat(x[:2], mass[:2, :2] @ x[2:4], x[4:])
+    for i, (ahead, weight) in enumerate(RK4_STAGES):
+        if i:
+            motion.move(y[:2], y[4:])
+        factors = motion.model.dt * ca.DM([ahead, weight])
+        y, total = stage_graph(motion.n)(*motion.known(), y, start, total, factors)
+    p, momentum, q = ca.vertsplit(total, [0, 2, 4, 4 + motion.n])
+    motion.move(p, q)
+    return ca.vertcat(p, stop_graph(motion.n)(*motion.known(), momentum), q)
+
+
+_INTEGRATORS = {"semi_implicit_euler": _semi_implicit_euler, "velocity_verlet": _velocity_verlet, "rk4": _rk4}
+
+
+def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
+    """One step from a pose that is solved to the next.
+
+    Nothing is decided in here: the caller reads the verdict, and keeps the result or does not (see `limits`).
+
+    Parameters
+    ----------
+    corrections : int
+        Newton iterations for each force.
+    details : bool
+        Whether record and result are wanted.
+
+    Returns
+    -------
+    casadi.Function
+        (memory, x (4 + n), [u, f_ext] (n + 2)) -> memory, x, verdict (5) and, with details, record and result at the
+        end of the step (see `warm_step`). A memory is of the pose of its x. u is what the motors are told, f_ext comes
+        on top of the tip's weight. The verdict is that of `warm_step`, added up over the solves of the step.
+    """
+    robot, n, dt = model.robot, model.robot.n_rods, model.dt
+    graphs = [warm_step(model.rods, model.method, corrections)]
+    if model.inertia == "condensed":
+        graphs.append(robot_mass(robot, model.method))
+    symbol: Any = (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym
+    memory, x, given = symbol("memory", sum(model.widths)), symbol("x", 4 + n), symbol("given", n + 2)
+    u, f_ext = given[:n], given[n:]
+    # As Robot.motor_rates.
+    lower, upper, limit, q = ca.DM(robot.angle_limits[:, 0]), ca.DM(robot.angle_limits[:, 1]), robot.rate_limit, x[4:]
+    rates = ca.fmin(ca.fmax(u, -limit), limit)
+    rates = (ca.fmin(ca.fmax(q + dt * rates, lower), upper) - q) / dt
+    rates = ca.fmin(ca.fmax(rates, -limit), limit)
+    motion = _Motion(model, memory, rates, f_ext + ca.DM(robot.tip_weight), corrections)
+    end = _INTEGRATORS[model.integrator](motion, x)
+    results = [motion.memory(), end, motion.verdict]
+    if details:
+        results += [motion.record, motion.result]
+    return ca.Function("step", [memory, x, given], [ca.densify(r) for r in results])
+
+
+@lru_cache(maxsize=32)
+def step_function(model: StepModel, corrections: int, *, details: bool, compiled: bool) -> Any:
+    """`step_graph` as it is, or as machine code."""
+    function = step_graph(model, corrections, details=details)
+    return machine_code(function) if compiled else function
+
+
+def limits(model: StepModel) -> list[float]:
+    """Largest entries of a verdict with which the rods have followed; NaN is beyond every limit."""
+    return [model.method.following, PREDICTOR_ACCURACY, BRANCH_CHANGE, 0.0, LARGEST_DRIFT]
