@@ -21,7 +21,7 @@ def summary(name, **changes):
 
 
 def test_they_are_shipped():
-    assert {path.stem for path in SCENES} >= {"pick_and_place"}
+    assert {path.stem for path in SCENES} >= {"lemniscate", "pick_and_place"}
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
@@ -33,6 +33,12 @@ def test_each_is_used_and_says_where_it_comes_from(path):
     assert f'# Tuned for the scene "{path.stem}" by pcr-mpc tune; it started from "' in text
     assert re.search(r"seeds \d+ to \d+; code at [0-9a-f]{12}\.", text)
     assert float(re.search(r"# Score ([\d.]+) on other episodes", text)[1]) < 1.0
+
+
+def test_the_main_job_is_done_to_eight_micrometres():
+    found = summary("lemniscate", duration=2.0)
+    assert found["rms_after_1s_mm"] <= 0.008
+    assert (found["failures"], found["limit_violations"], found["fallbacks"]) == (0, 0, 0)
 
 
 def test_it_beats_the_default_on_an_episode_that_no_search_has_seen():
