@@ -21,7 +21,7 @@ def summary(name, **changes):
 
 
 def test_they_are_shipped():
-    assert {path.stem for path in SCENES} >= {"lemniscate", "pick_and_place"}
+    assert {path.stem for path in SCENES} >= {"hold_with_load", "lemniscate", "pick_and_place"}
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
@@ -39,6 +39,12 @@ def test_the_main_job_is_done_to_eight_micrometres():
     found = summary("lemniscate", duration=2.0)
     assert found["rms_after_1s_mm"] <= 0.008
     assert (found["failures"], found["limit_violations"], found["fallbacks"]) == (0, 0, 0)
+
+
+def test_the_offset_of_an_unknown_load_is_gone():
+    found = summary("hold_with_load")
+    assert found["final_error_mm"] <= 0.01
+    assert found["limit_violations"] == 0
 
 
 def test_it_beats_the_default_on_an_episode_that_no_search_has_seen():

@@ -41,7 +41,8 @@ class Shuffled(Here):
 
 @pytest.fixture(scope="module")
 def scene():
-    return replace(load_scene(MODELS / "scenes" / "lemniscate.toml"), duration=0.1)
+    scene = load_scene(MODELS / "scenes" / "lemniscate.toml").tuned(load_tuning(CONTROLLERS / "default.toml"))
+    return replace(scene, duration=0.1)
 
 
 @pytest.fixture
@@ -302,7 +303,8 @@ def test_tune_writes_a_tuning_that_beats_its_start(tmp_path, monkeypatch, capsys
     for folder in (MODELS, CONTROLLERS):
         shutil.copytree(folder, tmp_path / folder.name)
     scene = tmp_path / "models/scenes/pick_and_place.toml"
-    text = scene.read_text().replace("duration = 1.6", "duration = 0.5")
+    text = scene.read_text().replace("duration = 1.6", "duration = 0.5").replace("pick_and_place.toml", "default.toml")
+    (tmp_path / "controllers/pick_and_place.toml").unlink()
     scene.write_text(text + "\n[load]\nforce = [2.0, -4.0]\n")
     poor = tmp_path / "controllers/default.toml"
     poor.write_text(poor.read_text().replace("force_walk = 0.005", "force_walk = 1.0e-6"))
