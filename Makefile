@@ -28,6 +28,8 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/snap.py --out docs
 	$(BIN)/python experiments/rod_inertia.py --out docs
 	$(BIN)/python -m experiments.mujoco_agreement --out docs
+	$(BIN)/python experiments/growth.py --out docs
+	$(BIN)/python experiments/rungs.py --out docs
 	$(BIN)/python experiments/workspace.py --out results/workspace
 	cp results/workspace/*.png docs/
 	$(BIN)/python experiments/basins.py --seeds 3 --out results/basins

@@ -8,6 +8,7 @@ Fig. 4  A pose by multiple shooting, N = 8, tip at (0.18, 0.12): the segments an
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,9 @@ def figure_2(folder: Path) -> None:
 def figure_3(folder: Path) -> None:
     """Tip response with the motors fixed."""
     scene = load_scene(MODELS / "scenes" / "release.toml")
+    # The paper's model and time step, not the scene's own.
+    of_paper = replace(scene.plant, inertia="none", integrator="semi_implicit_euler", dt=1e-3)
+    scene = replace(scene, plant=of_paper)
     run = simulate(scene, scene.make_plant(), make_controller(scene))
     figure, (time_axes, path_axes) = plt.subplots(1, 2, figsize=(10, 4), width_ratios=(2, 1))
     for axis, (name, colour) in enumerate((("x", BLUE), ("y", ORANGE))):

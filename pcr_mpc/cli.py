@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import re
 import sys
 import traceback
@@ -12,8 +11,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from .cli_statics import export, solve_pose
 from .control.tuning import load_tuning
 from .errors import PCRError, SimulationError
+from .loop.choice import choose
+from .loop.chosen_rung import write_rung
 from .loop.episodes import Spread, lighter
 from .loop.model_inertia import by_model_inertia
 from .loop.parallel import local_workers
@@ -27,19 +29,12 @@ from .loop.tracking import make_controller
 from .loop.tuning_file import default_path, to_tune, write_tuning
 from .loop.tuning_space import Search
 from .loop.tuning_study import finished_trials, tune
-from .plant.equilibrium import Equilibrium
-from .plant.free_tip import forward_statics, inverse_statics
-from .plant.mjcf import mjcf
 from .plant.mujoco_plant import MuJoCoPlant
-from .plant.robot import load_robot
-from .plant.stability import all_equilibria, assess_stability
-from .plant.statics import METHODS, solve_statics
+from .plant.statics import METHODS
+from .report.choice_tables import choice_record, choice_table
 from .report.csv_rows import write_rows
-from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
+from .report.plots import animate_run, plot_run
 from .report.tables import (
-    equilibria_table,
-    equilibrium_record,
-    equilibrium_table,
     summary_table,
     tuning_comments,
     tuning_table,
@@ -56,6 +51,7 @@ examples:
   pcr-mpc statics models/planar_pair.toml --p 0.18 0.12 --equilibria   what else it could snap to
   pcr-mpc track models/scenes/lemniscate.toml --plant mujoco       against another engine's robot
   pcr-mpc export models/planar_pair.toml --p 0 0.25 --mode LR --out pair.xml     that robot as MJCF
+  pcr-mpc choose models/scenes/vertical.toml             what physics the scene needs, and why
   pcr-mpc timing models/scenes/lemniscate.toml           step times against the real-time budgets
   pcr-mpc tune models/scenes/pick_and_place.toml --trials 20 --jobs 2     a better controller for it
 """
@@ -110,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
 
     statics = command(
         "statics",
-        _statics,
+        solve_pose,
         "Solve a pose: give --p and --q, or one of them to find the other in balance with --force.",
     )
     statics.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
@@ -129,12 +125,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     statics.add_argument("--picture", type=Path, metavar="FILE", help="draw the pose into FILE")
 
-    export = command("export", _export, "Write a robot in balance as a model file of MuJoCo (MJCF).")
-    export.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
-    export.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), required=True, help="tip position [m]")
-    export.add_argument("--mode", help="working mode, a letter L or R per rod, such as LR")
-    export.add_argument("--links", type=int, default=_LINKS, help=f"of each rod (default {_LINKS})")
-    export.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file, such as planar_pair.xml")
+    mjcf = command("export", export, "Write a robot in balance as a model file of MuJoCo (MJCF).")
+    mjcf.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
+    mjcf.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), required=True, help="tip position [m]")
+    mjcf.add_argument("--mode", help="working mode, a letter L or R per rod, such as LR")
+    mjcf.add_argument("--links", type=int, default=_LINKS, help=f"of each rod (default {_LINKS})")
+    mjcf.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file, such as planar_pair.xml")
+
+    choice = command(
+        "choose",
+        _choose,
+        "Find the lowest physics and the cheapest discretisation that meet what a scene's [need] table asks for.",
+    )
+    choice.add_argument("scene", type=Path, help="scene file, such as models/scenes/vertical.toml")
+    choice.add_argument("--write", action="store_true", help="put the chosen rung into the scene's [plant] table")
 
     timing = command(
         "timing", _timing, "Time plant steps of every method and the control step against their budgets; draw it."
@@ -182,7 +186,8 @@ def _track(options: argparse.Namespace) -> int:
     if options.plant:
         plant = MuJoCoPlant(scene.robot, links=_LINKS if options.links is None else options.links, dt=scene.plant.dt)
     elif options.method:
-        plant = replace(scene, plant=replace(scene.plant, method=options.method)).make_plant()
+        scene = replace(scene, plant=replace(scene.plant, method=options.method))
+        plant = scene.make_plant()
     folder = options.out or Path("results") / scene.name
     folder.mkdir(parents=True, exist_ok=True)  # rather now than after the run
     failure: SimulationError | None = None
@@ -211,58 +216,12 @@ def _pictures(run: Run, folder: Path) -> dict[str, str]:
     return {"track.png": str(picture), "track.gif": str(animation)}
 
 
-def _statics(options: argparse.Namespace) -> int:
-    robot = load_robot(options.robot)
-    q = options.q
-    if options.method and (options.p is None or q is None):
-        raise ValueError("--method goes with both --p and --q")
-    if options.mode and (options.p is None or q is not None):
-        raise ValueError("--mode goes with --p alone")
-    if options.force is not None and options.p is not None and q is not None:
-        raise ValueError("--force goes with --p alone or --q alone")
-    force = options.force or (0.0, 0.0)
-    if q is not None and options.degrees:
-        q = [math.radians(angle) for angle in q]
-    if options.p is not None and q is not None:
-        eq = solve_statics(robot, options.p, q, method=options.method or "closed_form")
-    elif options.p is not None:
-        eq = inverse_statics(robot, options.p, force, mode=options.mode)
-    elif q is not None:
-        eq = forward_statics(robot, q, force)
-    else:
-        raise ValueError("give --p, --q or both")
-    if options.equilibria:
-        return _equilibria(options, eq)
-    print(json.dumps(equilibrium_record(eq)) if options.json else equilibrium_table(eq))
-    if options.picture:
-        plot_equilibrium(eq, options.picture)
-    return 0
-
-
-def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:
-    found = all_equilibria(eq.robot, None if options.p is None else eq.p, eq.q, options.force or (0.0, 0.0))
-    if options.json:
-        records = [
-            {**equilibrium_record(one), "unstable_directions": assess_stability(one).unstable_directions}
-            for one in found
-        ]
-        print(json.dumps(records))
-    else:
-        print(equilibria_table(found))
-    picture = options.picture or Path("results") / "equilibria.png"
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    plot_equilibria(found, picture)
-    print(f"drawn in {picture}", file=sys.stderr)
-    return 0
-
-
-def _export(options: argparse.Namespace) -> int:
-    robot = load_robot(options.robot)
-    eq = inverse_statics(robot, options.p, mode=options.mode)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(mjcf(robot, pose=eq, links=options.links), encoding="utf-8")
-    record = {"file": str(options.out), "links": options.links, "mode": eq.mode, "q": eq.q.tolist()}
-    print(json.dumps(record) if options.json else f"{options.links} links a rod, mode {eq.mode}: {options.out}")
+def _choose(options: argparse.Namespace) -> int:
+    choice = choose(load_scene(options.scene), progress=True)
+    print(json.dumps(choice_record(choice)) if options.json else f"\n{choice_table(choice)}")
+    if options.write:
+        write_rung(choice, options.scene)
+        print(f"written to {options.scene}", file=sys.stderr)
     return 0
 
 

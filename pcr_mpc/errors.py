@@ -71,6 +71,10 @@ class CompilerError(PCRError):
     """No machine code could be made of a graph; ``command`` is what was run."""
 
 
+class NoRungError(PCRError):
+    """No rung of the ladder of physics meets a scene's ``need``: ``best_error`` [m], and why each was ``rejected``."""
+
+
 class StudyError(PCRError):
     """A study of many runs cannot go on, or ended without some of its results; names the file of those that it has."""
 

@@ -120,6 +120,11 @@ class Table:
             raise self.fail(key, f"expected {expected}, found {value!r}")
         return value
 
+    def has(self, key: str) -> bool:
+        """Whether the key is there and not taken yet."""
+        self._known.append(key)
+        return key in self._data
+
     def table(self, key: str, default: Any = _REQUIRED) -> Table:
         """Take a sub-table (pass ``default={}`` if it may be left out)."""
         value = self._take(key, default)

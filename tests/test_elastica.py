@@ -117,3 +117,22 @@ def test_chart_is_symmetric():
     for xi, eta in ((0.5, 0.6), (-0.3, 0.2), (0.7, -0.5)):
         up, down = held_shapes(xi, eta)[0], held_shapes(xi, -eta)[0]
         assert (up.hand, up.load, up.energy) == pytest.approx((-down.hand, down.load, down.energy))
+
+
+@pytest.mark.parametrize("hand", [1.0, -1.0])
+def test_chord_leaves_the_third_power_of_an_error(hand):
+    newton, residual = elastica.rod_newton()
+    exact = np.array([np.log(0.7), 2.6, hand])
+    pose = np.array([0.0, 0.0, 0.8])
+    # The Newton step towards a target at the base, seen in the world, is minus the tip.
+    step, tangent, *_ = newton(exact, pose)
+    pose[:2] = -np.linalg.solve(tangent.full()[:2, :2], step.full().ravel()[:2])
+    left = []
+    for error in (2e-2, 1e-2):
+        start = exact + error * np.array([1.0, -0.5, 0.0])
+        step, tangent, *_ = newton(start, pose)
+        second = start + step.full().ravel()
+        third = second + elastica.rod_chord()(second, pose, tangent).full().ravel()
+        left.append([float(residual(unknowns, pose)[0]) for unknowns in (start, second, third)])
+    orders = np.log2(np.array(left[0]) / np.array(left[1]))
+    assert orders == pytest.approx([1, 2, 3], abs=0.15)

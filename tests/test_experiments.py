@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from experiments import basins, rod_inertia
+from experiments import basins, growth, rod_inertia
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +59,20 @@ def test_rod_inertia_ladder(pair):
     assert errors["constant"] < 0.2 * errors["none"]
     assert errors["condensed"] < min(0.02 * errors["constant"], 5e-3)
     assert errors["full"] < 0.1 * errors["condensed"]
+
+
+def test_growth_fit_tells_the_fixed_part_from_the_growing_one():
+    n = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    slope, fixed, growing = growth.fit(n, 30.0 + 2.0 * n**2, 2.0)
+    assert (fixed, growing) == (pytest.approx(30.0), pytest.approx(2.0))
+    assert slope == pytest.approx(np.polyfit(np.log(n[2:]), np.log(30.0 + 2.0 * n[2:] ** 2), 1)[0])
+    assert growth.fit(n, 5.0 * n, 1.0) == (pytest.approx(1.0), pytest.approx(0.0, abs=1e-9), pytest.approx(5.0))
+
+
+@pytest.mark.parametrize("n", [2, 3, 8])
+def test_growth_robots_rest_at_the_centre(pair, n):
+    robot, pose = growth.circle(pair, n)
+    assert robot.n_rods == n
+    assert pose.stable
+    assert pose.force == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert pose.p == pytest.approx(growth.CENTRE)

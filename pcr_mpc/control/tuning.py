@@ -31,6 +31,8 @@ class Model:
         Of the rods (see `Plant`).
     linearise : {"here", "along_plan"}
         Once, at the current state, or at every period of the last plan (real-time iteration).
+    payload : bool
+        Follow the scene's time table of what the tip carries, in the feed-forward and in what is linearised.
     predict_delay : bool
         Plan from where the commands that are on the way will have brought the robot.
     """
@@ -41,6 +43,7 @@ class Model:
     scheme: str = "rk8"
     inertia: str = "none"
     linearise: str = "here"
+    payload: bool = True
     predict_delay: bool = True
 
 
@@ -194,6 +197,7 @@ def load_tuning(path: str | Path) -> Tuning:
                 scheme=model.text("scheme", Model.scheme, choices=SCHEMES),
                 inertia=model.text("inertia", Model.inertia, choices=INERTIAS),
                 linearise=model.text("linearise", Model.linearise, choices=LINEARISE),
+                payload=model.boolean("payload", Model.payload),
                 predict_delay=model.boolean("predict_delay", Model.predict_delay),
             ),
             observer=noise if observed else None,

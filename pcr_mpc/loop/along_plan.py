@@ -51,14 +51,20 @@ class AlongPlan:
             spot.plant.reset(x, pose)
             spot.model = None
 
-    def models(self, path: np.ndarray, u: np.ndarray, force: np.ndarray) -> list[LinearModel]:
-        """Models about the states of ``path``, shape (N - 1, 4 + n), under an external force; errors as `linearise`."""
+    def models(self, path: np.ndarray, u: np.ndarray, force: np.ndarray, payloads: np.ndarray) -> list[LinearModel]:
+        """Models about the states of ``path``, shape (N - 1, 4 + n), under an external force; errors as `linearise`.
+
+        ``payloads`` are what the tip carries there, shape (N - 1,) [kg].
+        """
         places = np.concatenate([path[:, :2], path[:, 4:]], axis=1)
         # So written that NaN is far.
         near = (np.abs(places - self._at) <= self._moved).all(axis=1).tolist()
         found = []
-        for k, spot in enumerate(self._spots):
+        for k, (spot, payload) in enumerate(zip(self._spots, payloads.tolist(), strict=True)):
             model = spot.model
+            if payload != spot.plant.payload:
+                spot.plant.carry(payload, path[k])
+                model = None
             if model is None or not near[k]:
                 self._at[k] = np.nan
                 model = linearise(spot.plant, path[k], u, self._period, force)

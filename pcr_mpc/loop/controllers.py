@@ -42,6 +42,28 @@ class Controller(Protocol):
         """Decide on period k from the measured state."""
 
 
+class Replay:
+    """Rates that were commanded before, whatever is measured.
+
+    Parameters
+    ----------
+    u : ndarray, shape (M, n)
+        Motor rates of every period [rad/s].
+    """
+
+    name = "replay"
+
+    def __init__(self, u: np.ndarray) -> None:
+        self._u = u
+
+    def start(self, pose: Equilibrium) -> None:
+        """See `Controller`."""
+
+    def step(self, k: int, x: np.ndarray) -> Decision:
+        """See `Controller`."""
+        return Decision(self._u[k])
+
+
 class HoldMotors:
     """No control: the motors stay where they are."""
 

@@ -191,7 +191,8 @@ def simulate_episode(
     reference = None
     if believed.trajectory is not None:
         tail = tuning.horizon + believed.delay
-        reference = _reference(replace(believed, tuning=None), tail, tuning.model.inertia)
+        payload = believed.payload if tuning.model.payload else None
+        reference = _reference(replace(believed, tuning=None, payload=payload), tail, tuning.model.inertia)
     controller = make_controller(
         replace(believed, angle_step=true.angle_step), robot=believed.robot, reference=reference
     )

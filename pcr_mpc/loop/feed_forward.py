@@ -41,8 +41,8 @@ class InverseDynamics(Reference):
 def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, inertia: str = "none") -> InverseDynamics:
     """Inverse dynamics of the reference at every period, and one horizon beyond the end.
 
-    The motor angles are those at which the rods carry F = -m a - c v on the reference; the rates lead from
-    each to the next.
+    The motor angles are those at which the rods carry F = -m a - c v on the reference, m with what the scene says that
+    the tip carries, whose weight is a part of F too; the rates lead from each to the next.
 
     Where the rods have inertia, F = -pi' + dT/dp - c v with the momentum pi = M_pp v + M_pq q' and the kinetic energy
     T = w' M w / 2, w = [v, q'] (see `integrators`), differences taken from period to period. M and q' are those of the
@@ -72,14 +72,17 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     assert scene.trajectory is not None
     t = scene.period * np.arange(scene.n_periods + horizon + 1)
     p, v, a = np.moveaxis(scene.trajectory(t), 1, 0)
-    forces = -robot.tip_mass * a - robot.drag * v
+    carried = scene.carried(t)
+    # Mass and weight of what is carried, which has nothing to do with the rods.
+    loads = carried[:, None] * (np.array(robot.gravity) - a)
+    forces = loads - robot.tip_mass * a - robot.drag * v
     q, levers = _angles(robot, pose, t, p, forces)
     if inertia != "none":
         plant = Plant(robot, inertia=inertia)
         for _ in range(_MOST_SWEEPS):
             plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
-            momentum, push, own = _momentum(plant, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
-            forces = push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
+            momentum, push, own = _momentum(plant, carried, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
+            forces = loads + push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
             before, (q, levers) = q, _angles(robot, pose, t, p, forces)
             change = float(np.abs(q - before).max())
             if change < _SETTLED:
@@ -115,9 +118,9 @@ def _angles(
 
 
 def _momentum(
-    plant: Plant, p: np.ndarray, v: np.ndarray, q: np.ndarray, rates: np.ndarray
+    plant: Plant, carried: np.ndarray, p: np.ndarray, v: np.ndarray, q: np.ndarray, rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Momentum pi [N s], dT/dp [N] and M_pp^-1 pi [m/s] at K poses, shape (K, 2) each."""
+    """Momentum of tip and rods [N s], dT/dp [N], M_pp^-1 pi with what is carried [m/s] at K poses, (K, 2) each."""
     n = 2 + plant.robot.n_rods
     momentum, push, own = (np.empty_like(p) for _ in range(3))
     for k in range(len(p)):
@@ -125,5 +128,5 @@ def _momentum(
         w = np.concatenate([v[k], rates[k]])
         momentum[k] = mass[:2] @ w
         push[k] = [w @ slopes[:, axis].reshape(n, n, order="F") @ w / 2 for axis in (0, 1)]
-        own[k] = np.linalg.solve(mass[:2, :2], momentum[k])
+        own[k] = np.linalg.solve(mass[:2, :2] + carried[k] * np.eye(2), momentum[k] + carried[k] * v[k])
     return momentum, push, own

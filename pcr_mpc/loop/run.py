@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,9 @@ import numpy as np
 from ..frozen import freeze
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
+from .finding import verified
 from .scene import Scene
+from .settings import PlantSettings
 
 # Commands within this of a limit keep it: rounding for rates, the QP's tolerance for angles.
 _LIMIT_SLACK = 1e-9
@@ -62,6 +64,8 @@ class Run:
         How many poses of the plant each rung of the statics' ladder has solved (see `RodSolver`).
     events : list of dict
         Fall-backs, missed deadlines, snaps and failures: time, kind, message.
+    rung : PlantSettings or None
+        Physics and discretisation of the plant. None: it was another engine's.
     """
 
     scene: Scene
@@ -81,6 +85,7 @@ class Run:
     slack: dict[str, float]
     rungs: dict[str, int]
     events: list[dict[str, Any]] = field(default_factory=list)
+    rung: PlantSettings | None = None
 
     def __post_init__(self) -> None:
         freeze(self)
@@ -120,6 +125,24 @@ class Run:
         states = self.x[:: self.steps_per_period]
         return float(max(np.abs(plant.equilibrium(x).motor_torque).max() for x in states))
 
+    def _need(self) -> dict[str, Any] | None:
+        """What the scene asks of the simulation, and what is known of that."""
+        need, finding = self.scene.need, self.scene.finding
+        if need is None:
+            return None
+        holds = self.rung is not None and verified(self.scene)
+        steps = float(np.median(self.plant_time)) if len(self.plant_time) else math.inf
+        control = float(np.median(self.control_time[:, 0])) if len(self.control_time) else 0.0
+        return {
+            "tip_accuracy_mm": 1e3 * need.tip_accuracy,
+            "tip_error_mm": 1e3 * finding.tip_error if finding is not None and holds else None,
+            "verified": holds,
+            "plant_step_us": 1e6 * need.plant_step,
+            "plant_step_met": steps <= need.plant_step,
+            "control_step_us": 1e6 * need.control_step,
+            "control_step_met": control <= need.control_step,
+        }
+
     def hash(self) -> str:
         """Digest of states and inputs: equal for runs that are equal bit for bit."""
         digest = hashlib.sha256()
@@ -138,6 +161,8 @@ class Run:
             "scene": self.scene.name,
             "controller": self.controller,
             "plant": self.plant,
+            "rung": None if self.rung is None else asdict(self.rung),
+            "need": self._need(),
             "seed": self.seed,
             "duration_s": float(self.t[-1]),
             "rms_mm": _rms(error_mm) if tracked else None,
@@ -183,6 +208,7 @@ class Run:
         np.savez_compressed(
             files["run.npz"], t=self.t, x=self.x, u=self.u, reference=self.reference, plant_time=self.plant_time,
             control_time=self.control_time, iterations=self.iterations,
+            rung=json.dumps(self.rung and asdict(self.rung)), need=json.dumps(self._need()),
         )  # fmt: skip
         n = self.scene.robot.n_rods
         per = self.steps_per_period

@@ -11,15 +11,12 @@ import numpy as np
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError
 from ..linearisation.pose_limits import PoseLimits
-from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
+from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import forward_statics, inverse_statics
-from ..plant.inertia import INERTIAS
 from ..plant.robot import Robot, load_robot
-from ..plant.rod import SCHEMES
-from ..plant.statics import METHODS, default_method
-from ..plant.weight import WEIGHTS
 from ..toml_table import Table, read_toml
+from .settings import Finding, Need, Payload, PlantSettings, read_finding, read_need, read_payload, read_plant
 from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 
 LATE = ("hold", "shifted_plan")
@@ -27,21 +24,6 @@ LATE = ("hold", "shifted_plan")
 _START_TOLERANCE = 1e-3
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
-
-
-@dataclass(frozen=True)
-class PlantSettings:
-    """How the plant is simulated: the arguments of `Plant`."""
-
-    method: str
-    segments: int
-    steps: int
-    scheme: str
-    integrator: str
-    dt: float
-    on_snap: str
-    inertia: str = "none"
-    weight: str | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +66,11 @@ class Scene:
         What the motors do until a late decision arrives: go on as before, or as the last plan foresaw.
     pose_limits : PoseLimits
         Torque, tip region and stability margins, which a controller keeps if it can.
+    payload : Payload or None
+    need : Need or None
+        What is asked of the simulation.
+    finding : Finding or None
+        What is known of the plant's rung.
     own_period : float or None
         Control period of the scene [s], where its tuning asks for another.
     """
@@ -106,7 +93,14 @@ class Scene:
     deadline: float = math.inf
     late: str = LATE[0]
     pose_limits: PoseLimits = field(default_factory=PoseLimits)
+    payload: Payload | None = None
+    need: Need | None = None
+    finding: Finding | None = None
     own_period: float | None = None
+
+    def carried(self, t: np.ndarray) -> np.ndarray:
+        """Payload at the times t [s], same shape [kg]."""
+        return np.zeros(np.shape(t)) if self.payload is None else self.payload.carried(t)
 
     @property
     def n_periods(self) -> int:
@@ -155,19 +149,7 @@ class Scene:
 
     def make_plant(self) -> Plant:
         """Build the plant of this scene."""
-        settings = self.plant
-        return Plant(
-            self.robot,
-            method=settings.method,
-            segments=settings.segments,
-            steps=settings.steps,
-            scheme=settings.scheme,
-            integrator=settings.integrator,
-            dt=settings.dt,
-            on_snap=settings.on_snap,
-            inertia=settings.inertia,
-            weight=settings.weight,
-        )
+        return self.plant.make(self.robot)
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -200,21 +182,7 @@ def load_scene(path: str | Path) -> Scene:
             if (tip is None) == (motors is None) or (tip is None) != (mode is None):
                 raise start.fail("tip", "give either tip and mode, or motors")
         with file.table("plant") as table:
-            plant = PlantSettings(
-                method=table.text("method", default_method(robot), choices=METHODS),
-                segments=table.integer("segments", 8),
-                steps=table.integer("steps", 1),
-                scheme=table.text("scheme", "rk8", choices=tuple(SCHEMES)),
-                integrator=table.text("integrator", choices=(*INTEGRATORS, "gauss")),
-                dt=table.number("dt", above=0.0),
-                on_snap=table.text("on_snap", "raise", choices=ON_SNAP),
-                inertia=table.text("inertia", "none", choices=INERTIAS),
-                weight=table.text("weight", None, choices=WEIGHTS),
-            )
-            if (plant.inertia == "full") != (plant.integrator == "gauss"):
-                raise table.fail("integrator", f"is {plant.integrator}: inertia 'full' needs 'gauss', and only it does")
-            if plant.inertia != "none" and plant.method == "single_shooting":
-                raise table.fail("inertia", f"is {plant.inertia}, which method 'single_shooting' does not know")
+            plant = read_plant(table, robot)
         with file.table("control") as control:
             period = control.number("period", above=0.0)
             tuning = control.text("tuning", None)
@@ -230,11 +198,13 @@ def load_scene(path: str | Path) -> Scene:
             force = load.vector("force", 2, (0.0, 0.0))
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
+        payload = read_payload(file)
+        need, finding = read_need(file), read_finding(file)
         with file.table("reference") as reference:
             trajectory = _trajectory(reference)
     scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                   tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
-                  delay, deadline, late, pose_limits)  # fmt: skip
+                  delay, deadline, late, pose_limits, payload, need, finding)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

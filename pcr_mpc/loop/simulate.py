@@ -76,6 +76,9 @@ def simulate(
     states[0] = x
     done, decided, snapped = 0, 0, 0
     meanwhile = np.zeros(n)
+    carries = scene.plant.payload == "carried"
+    payloads = carries * scene.carried(plant.dt * np.arange(n_periods * per))
+    changes = set(np.flatnonzero(np.diff(payloads, prepend=0.0)).tolist())
 
     def record() -> Run:
         t = plant.dt * np.arange(done + 1)
@@ -98,6 +101,7 @@ def simulate(
             slack=slack,
             rungs=plant.rungs,
             events=events,
+            rung=scene.plant if scene.plant.describes(plant) else None,
         )
 
     try:
@@ -139,6 +143,8 @@ def simulate(
                     )
             for j in range(per):
                 u = meanwhile if j < waiting else arrived
+                if done in changes:
+                    x = plant.carry(float(payloads[done]), x)
                 began = time.perf_counter()
                 x = plant.step(x, u, scene.force)
                 plant_time[done] = time.perf_counter() - began

@@ -36,5 +36,8 @@ class SimulatedPlant(Protocol):
     def reset(self, x: Any, guess: Equilibrium | None = None) -> None:
         """Put the rods on the branch of ``guess`` at state x."""
 
+    def carry(self, payload: float, x: Any) -> np.ndarray:
+        """Let the tip carry a payload [kg] from state x on; return the state just after."""
+
     def step(self, x: Any, u: Any, f_ext: Any = (0.0, 0.0)) -> np.ndarray:
         """Advance by one time step with the motor rates held."""

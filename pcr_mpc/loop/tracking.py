@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -54,7 +55,8 @@ class TrackingController:
         self.name = tuning.name
         self.robot = robot or scene.robot
         self.observer: DisturbanceObserver | None = None
-        self._scene, self._tuning = scene, tuning
+        # A payload that the model does not know is one that the scene does not have.
+        self._scene, self._tuning = scene if tuning.model.payload else replace(scene, payload=None), tuning
         self._delay = scene.delay if tuning.model.predict_delay else 0
         self._known = reference
         needed = scene.n_periods + tuning.horizon + self._delay
@@ -76,6 +78,7 @@ class TrackingController:
         """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
         tail, inertia = self._tuning.horizon + self._delay, self._tuning.model.inertia
         self._reference = self._known or feed_forward(self._scene, self.robot, pose, tail, inertia)
+        self._payloads = self._scene.carried(self._scene.period * np.arange(self._scene.n_periods + tail))
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         if self._law is None:
             self._law = self._make_law(pose)
@@ -108,7 +111,7 @@ class TrackingController:
 
     def step(self, k: int, x: np.ndarray) -> Decision:
         """See `Controller`; a measurement that is not finite is bridged by the prediction."""
-        period, observer = self._scene.period, self.observer
+        observer = self.observer
         force = np.zeros(2)
         if observer is not None:
             if all(map(math.isfinite, x[:2].tolist() + x[4:].tolist())):
@@ -119,8 +122,8 @@ class TrackingController:
         models: LinearModel | list[LinearModel] | None = None
         pose_limits: LinearLimits | None = None
         try:
-            for u in self._on_the_way:
-                model = linearise(self._model, ahead, u, period, force)
+            for j, u in enumerate(self._on_the_way):
+                model = self._model_at(k + j, ahead, u, force)
                 now = now or model
                 ahead = model(ahead, u)
             models = self._linearise(ahead, k, force)
@@ -148,16 +151,23 @@ class TrackingController:
         return Decision(plan.inputs[0], plan, linearised)
 
     def _linearise(self, x: np.ndarray, k: int, force: np.ndarray) -> LinearModel | list[LinearModel]:
-        here = linearise(self._model, x, self._u, self._scene.period, force)
+        here = self._model_at(k + self._delay, x, self._u, force)
         if self._along is None:
             return here
+        first = k + self._delay + 1
         # The last plan, one period on; at the start the reference.
         if self._plan is None or self._plan.states is None:
-            first = k + self._delay + 1
             path = self._reference.states[first : first + self._tuning.horizon - 1]
         else:
             path = self._plan.states[2:]
-        return [here, *self._along.models(path, self._u, force)]
+        return [here, *self._along.models(path, self._u, force, self._payloads[first : first + len(path)])]
+
+    def _model_at(self, k: int, x: np.ndarray, u: np.ndarray, force: np.ndarray) -> LinearModel:
+        """Linear model about x, with what the tip carries in period k."""
+        payload = float(self._payloads[k])
+        if payload != self._model.payload:
+            self._model.carry(payload, x)
+        return linearise(self._model, x, u, self._scene.period, force)
 
     def _window(self, k: int, force: np.ndarray) -> Reference:
         """Reference over the horizon from period k on, its angles moved to carry the unknown force."""
@@ -184,6 +194,8 @@ class TrackingController:
         if tuning.law == "linear_mpc":
             return LinearMPC(tuning, limits)
         if tuning.law == "nonlinear_mpc":
+            if self._scene.payload is not None:
+                raise ValueError("the nonlinear MPC knows no payload; set [model] payload = false in its tuning")
             hands, algebraic = rod_unknowns(self.robot, pose)
             return NonlinearMPC(tuning, limits, symbolic_dynamics(self.robot, hands), algebraic)
         if tuning.law == "lqr":

@@ -87,6 +87,7 @@ def _toml(tuning: Tuning, comments: Sequence[str]) -> str:
         f'scheme = "{model.scheme}"',
         f'inertia = "{model.inertia}"',
         f'linearise = "{model.linearise}"',
+        f"payload = {str(model.payload).lower()}",
         f"predict_delay = {str(model.predict_delay).lower()}",
     ]
     if observer is not None:

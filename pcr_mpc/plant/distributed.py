@@ -49,6 +49,7 @@ class DistributedRods:
 
     def __init__(self, robot: Robot, modes: int) -> None:
         self.robot = robot
+        self.tip_mass = robot.tip_mass  # [kg]; more while the tip carries a payload
         self.modes = StrainModes(robot, modes)
         self._units = robot.stiffnesses / robot.lengths**2  # of forces
         n = robot.n_rods
@@ -131,11 +132,20 @@ class DistributedRods:
         a, a_dot = y[:-2].reshape(n, -1), y_dot[:-2].reshape(n, -1)
         return self._pinned(ModalState(a, a_dot, y[-2:], y_dot[-2:], state.q + dt * u, u.copy()))
 
+    def picked_up(self, state: ModalState, mass: float) -> ModalState:
+        """State after ``mass`` [kg], at rest, has joined the tip, whose own mass holds it already."""
+        width = self._n_modes + 2
+        right = np.zeros(self._size)
+        right[width - 2 : width] = -mass * state.v
+        change = self._solve(state, right)
+        a_dot = state.a_dot + change[: width - 2].reshape(self.robot.n_rods, -1)
+        return replace(state, a_dot=a_dot, v=state.v + change[width - 2 : width])
+
     def energy(self, state: ModalState) -> float:
         """Kinetic energy, and that of the rods' bending and weight [J]."""
         kinetic, potential = self.modes.energies(state.a, state.a_dot, state.q, state.u)
         of_rods = (kinetic + potential) @ (self.robot.stiffnesses / self.robot.lengths)
-        return float(of_rods + self.robot.tip_mass * state.v @ state.v / 2)
+        return float(of_rods + self.tip_mass * state.v @ state.v / 2)
 
     def _residual(
         self, y: np.ndarray, y_dot: np.ndarray, unknowns: np.ndarray, q: np.ndarray, u: np.ndarray, f_ext: np.ndarray
@@ -149,7 +159,7 @@ class DistributedRods:
             self.modes.angles(a, q), self.modes.turned(a_dot, u), self.modes.turned(faster, still), forces
         )
         on_modes += self.modes.elastic_moments(a)
-        on_tip = self.robot.tip_mass * acceleration + self.robot.drag * y_dot[..., -2:] - f_ext
+        on_tip = self.tip_mass * acceleration + self.robot.drag * y_dot[..., -2:] - f_ext
         on_tip += (self._units[:, None] * forces).sum(axis=-2)
         pins = self.robot.lengths[:, None] * tips - acceleration[..., None, :]
         return np.concatenate([on_modes.reshape(*stages, -1), on_tip, pins.reshape(*stages, -1)], axis=-1)
@@ -157,7 +167,7 @@ class DistributedRods:
     def _system(self, blocks: Blocks) -> np.ndarray:
         """Derivative of the residual in accelerations and pin forces."""
         n, width = self.robot.n_rods, self._n_modes + 2
-        system = self._rows(blocks.mass, blocks.jacobian, self.robot.tip_mass)
+        system = self._rows(blocks.mass, blocks.jacobian, self.tip_mass)
         per_rod = self._n_modes // n
         for i in range(n):
             columns = slice(width + 2 * i, width + 2 * i + 2)

@@ -7,25 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ConvergenceError, PCRError, UnstableError, checked_vector
+from ..errors import ConvergenceError, PCRError, UnstableError, checked_number, checked_vector
 from ..frozen import read_only
 from .equilibrium import Equilibrium
-from .inertia import INERTIAS
 from .integrators import INTEGRATORS
 from .mass_matrix import CondensedMass, MassMatrix, tip_mass
 from .modal_step import ModalStep
+from .plant_choices import ON_SNAP, checked_choices
 from .quick_step import QuickStep
 from .robot import Robot
 from .rod_solver import RodSolver, Snap
 from .rod_state import RobotState
-from .statics import checked_shooting, default_method, make_solver
+from .statics import checked_shooting, make_solver
 from .step_graph import LARGEST_DRIFT, PREDICTOR_ACCURACY, StepModel
-from .weight import WEIGHTS, CondensedWeight
+from .weight import CondensedWeight
 
-ON_SNAP = ("raise", "jump")
 # Residual of the statics at which derivatives may be taken for a linear model; their error is of this size.
 DERIVATIVE_ACCURACY = 1e-6
-_MOST_MODES = 64
 
 
 class Plant:
@@ -69,7 +67,8 @@ class Plant:
     -----
     A state does not say on which branch the rods are, so the plant follows them by continuity from one call
     to the next; `reset` starts elsewhere. Motors saturate: rates are clipped to the limit and angles stop at
-    theirs. (The limit on the change of rate concerns commands, and is the controller's.)
+    theirs. (The limit on the change of rate concerns commands, and is the controller's.) What the tip carries besides
+    its own mass is the plant's ``payload`` [kg], see `carry`.
 
     A motor's rate jumps from one step to the next, and a rod's mass makes that an impulse on the tip: the momentum
     M_pp p' + M_pq u has no jump, p' has one. The state's v is therefore M_pp^-1 times the momentum: the velocity
@@ -97,31 +96,7 @@ class Plant:
         on_snap: str = "raise",
         compiled: bool = False,
     ) -> None:
-        if on_snap not in ON_SNAP:
-            raise ValueError(f"on_snap is {on_snap!r}, expected one of {', '.join(ON_SNAP)}")
-        if inertia not in INERTIAS:
-            raise ValueError(f"inertia is {inertia!r}, expected one of {', '.join(INERTIAS)}")
-        if integrator not in (*INTEGRATORS, "gauss"):
-            raise ValueError(f"integrator is {integrator!r}, expected one of {', '.join(INTEGRATORS)}, gauss")
-        if (inertia == "full") != (integrator == "gauss"):
-            raise ValueError(f"inertia={inertia!r} does not go with integrator={integrator!r}: 'full' needs 'gauss'")
-        if weight is not None and weight not in WEIGHTS:
-            raise ValueError(f"weight is {weight!r}, expected one of {', '.join(WEIGHTS)}")
-        if weight is None:
-            heavy = any(robot.gravity) and any(rod.line_density for rod in robot.rods)
-            weight = "none" if not heavy else "condensed" if method == "closed_form" else "exact"
-        rods = robot if weight == "exact" else robot.weightless()
-        method = method or default_method(rods)
-        if weight == "condensed" and method != "closed_form":
-            raise ValueError(f"weight='condensed' needs method='closed_form', not {method!r}; take weight='exact'")
-        if weight == "condensed" and inertia == "full":
-            raise ValueError("inertia='full' does not condense the rods' weight; take weight='exact' or 'none'")
-        if inertia != "none" and method == "single_shooting":
-            raise ValueError(f"inertia={inertia!r} needs method='closed_form' or 'multiple_shooting', not {method!r}")
-        if not 0.0 < dt < np.inf:
-            raise ValueError(f"dt is {dt} s, expected a positive number")
-        if isinstance(modes, bool) or not isinstance(modes, int | np.integer) or not 4 <= modes <= _MOST_MODES:
-            raise ValueError(f"modes = {modes!r} must be a whole number from 4 to {_MOST_MODES}")
+        method, weight, rods = checked_choices(robot, method, inertia, modes, weight, integrator, dt, on_snap)
         self.robot = robot
         self.method = method
         self.inertia = inertia
@@ -139,6 +114,8 @@ class Plant:
         self._accuracy = 0.0  # of the derivatives there
         self._mass = tip_mass(robot)
         self._mass_at: list[float] | None = None
+        self.payload = 0.0
+        self._tip_weight = robot.tip_weight
         self._condensed: CondensedMass | None = None
         self.step_model: StepModel | None = None
         if isinstance(self._solver, RodSolver):
@@ -158,6 +135,7 @@ class Plant:
         self._at = None
         if self._quick is not None:
             self._quick.hand_over()
+        self._take(0.0)
         if guess is None:
             self._solver.start(p, q)
         else:
@@ -169,10 +147,57 @@ class Plant:
             assert self._condensed is not None
             self._mass = self._condensed(self._unknowns(), q)[0], self._mass[1]
 
+    def carry(self, payload: float, x: Any) -> np.ndarray:
+        """Let the tip carry a payload besides its own mass from state x on; a `reset` takes it away.
+
+        What is picked up was at rest: the momentum stays, and the tip becomes slower. What is put down leaves with the
+        velocity of the tip, which stays.
+
+        Parameters
+        ----------
+        payload : float
+            All that is carried from now on [kg]; it has weight where there is gravity.
+        x : array_like, shape (4 + n,)
+            State [m, m/s, rad].
+
+        Returns
+        -------
+        ndarray, shape (4 + n,)
+            State just after.
+        """
+        payload = checked_number("payload", payload, minimum=0.0)
+        after = checked_vector("x", x, self.n_states).copy()
+        p, v, q = after[:2], after[2:4], after[4:]
+        picked_up, momentum = payload - self.payload, self.mass(p, q)[0][:2, :2] @ v
+        self._take(payload)
+        if picked_up <= 0.0:
+            return after
+        if self._modal is not None and (vibrating := self._modal.pick_up(self, picked_up, after)) is not None:
+            return vibrating
+        v[:] = np.linalg.solve(self.mass(p, q)[0][:2, :2], momentum)
+        return after
+
+    def _take(self, payload: float) -> None:
+        if payload == self.payload:
+            return
+        mass, slopes = self._mass
+        n = self.robot.n_rods
+        self._mass = read_only(mass + np.diag([payload - self.payload] * 2 + [0.0] * n)), slopes
+        self.payload, self._mass_at = payload, None
+        self._tip_weight = self.robot.tip_weight + payload * np.array(self.robot.gravity)
+        if self.step_model is not None:
+            if self._quick is not None:
+                self._quick.hand_over()
+                self._quick = self._quick_at = None  # its graph has the mass of the tip
+            loaded = replace(self.robot, tip_mass=self.robot.tip_mass + payload)
+            self.step_model = replace(self.step_model, robot=loaded)
+        if self._modal is not None:
+            self._modal.rods.tip_mass = self.robot.tip_mass + payload
+
     @property
     def tip_weight(self) -> np.ndarray:
-        """m g, shape (2,) [N]."""
-        return self.robot.tip_weight
+        """Of tip mass and payload, shape (2,) [N]."""
+        return self._tip_weight
 
     @property
     def snaps(self) -> list[Snap]:
@@ -304,7 +329,7 @@ class Plant:
         force = self.force(p, q)
         if self._mass_moves and self._mass_at is not self._at:
             assert self._condensed is not None
-            self._mass, self._mass_at = self._condensed(self._unknowns(), q), self._at
+            self._mass, self._mass_at = self._condensed(self._unknowns(), q, self.payload), self._at
         return force, self._mass
 
     def tip_velocity(self, x: Any, u: Any) -> np.ndarray:
@@ -318,19 +343,7 @@ class Plant:
         x = checked_vector("x", x, self.n_states)
         self._go(x[:2], x[4:], None)
         eq = self._solver.equilibrium(x[:2], x[4:])
-        if self._sag is None:
-            return eq
-        energy, slope = self._sag.first(self._unknowns(), x[4:])
-        curvature = self._sag.second(self._unknowns(), x[4:])
-        return replace(
-            eq,
-            force=eq.force + slope[:2],
-            dforce_dp=eq.dforce_dp + curvature[:2, :2],
-            dforce_dq=eq.dforce_dq + curvature[:2, 2:],
-            motor_torque=eq.motor_torque + slope[2:],
-            dtorque_dq=eq.dtorque_dq + np.diag(curvature)[2:],
-            energy=eq.energy + energy,
-        )
+        return eq if self._sag is None else self._sag.added(eq, self._unknowns())
 
     def _unknowns(self) -> np.ndarray:
         assert isinstance(self._solver, RodSolver)

@@ -37,8 +37,8 @@ class CondensedMass:
     def __init__(self, robot: Robot, method: RodMethod) -> None:
         self._graph = BufferedFunction(robot_mass(robot, method))
 
-    def __call__(self, unknowns: np.ndarray, q: np.ndarray) -> MassMatrix:
-        """M and its slopes for w = [v, q'], in equilibrium.
+    def __call__(self, unknowns: np.ndarray, q: np.ndarray, payload: float = 0.0) -> MassMatrix:
+        """M and its slopes for w = [v, q'], in equilibrium, with what the tip carries [kg].
 
         Raises
         ------
@@ -48,7 +48,9 @@ class CondensedMass:
         graph = self._graph
         graph.inputs[0][:], graph.inputs[1][:] = unknowns, q
         graph()
-        mass, slopes = (read_only(output.copy()) for output in graph.outputs)
+        mass, slopes = (output.copy() for output in graph.outputs)
+        mass[0, 0] += payload
+        mass[1, 1] += payload
         if not math.isfinite(slopes.sum()):
             raise ConvergenceError(
                 f"the inertia of the rods at q = {q} rad has no finite derivative: a rod is straight and pushed; "
@@ -57,7 +59,7 @@ class CondensedMass:
                 iterations=0,
                 last=graph.inputs[0].copy(),
             )
-        return mass, slopes
+        return read_only(mass), read_only(slopes)
 
 
 @lru_cache(maxsize=16)

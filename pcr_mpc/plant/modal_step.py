@@ -34,6 +34,15 @@ class ModalStep:
         """Start with rods in equilibrium."""
         self._last = None
 
+    def pick_up(self, plant: Plant, mass: float, x: np.ndarray) -> np.ndarray | None:
+        """State after a mass at rest has joined the tip at x; None if the rods have no state there yet."""
+        if self._last is None or (x != self._last[0]).any():
+            return None
+        state = self.rods.picked_up(self._last[1], mass)
+        end = self._seen(plant, state)
+        self._last = end.copy(), state
+        return end
+
     def __call__(self, plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         """Advance by one step."""
         if self._last is not None and (x == self._last[0]).all():
@@ -41,9 +50,13 @@ class ModalStep:
         else:
             state = self.rods.settled(x[:2], x[2:4], x[4:], plant.equilibrium(x).nodes)
         state = self.rods.step(state, rate, f_ext, plant.dt)
-        # The tip's velocity once the motors stop and the rods have calmed down.
-        mass, _ = plant.mass(state.p, state.q)
-        v = state.v + np.linalg.solve(mass[:2, :2], mass[:2, 2:] @ rate)
-        end = np.concatenate([state.p, v, state.q])
+        end = self._seen(plant, state)
         self._last = end.copy(), state
         return end
+
+    @staticmethod
+    def _seen(plant: Plant, state: ModalState) -> np.ndarray:
+        """State of the plant, with the tip's velocity once the motors stop and the rods have calmed down."""
+        mass, _ = plant.mass(state.p, state.q)
+        v = state.v + np.linalg.solve(mass[:2, :2], mass[:2, 2:] @ state.u)
+        return np.concatenate([state.p, v, state.q])

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..errors import ConvergenceError, PCRError, checked_vector
+from ..errors import ConvergenceError, PCRError, checked_number, checked_vector
 from .dynamics import Plant
 from .equilibrium import Equilibrium
 from .hinge_chain import settled_chains
@@ -65,10 +66,7 @@ class MuJoCoPlant:
         self.n_states = 4 + robot.n_rods
         self.method = f"MuJoCo {self._mujoco.__version__}, {links} links"
         self.integrator = f"discrete at {1e6 * dt / substeps:g} us{' extrapolated' if extrapolated else ''}"
-        self._model = self._mujoco.MjModel.from_xml_string(
-            mjcf(robot, links=links, timestep=dt / substeps, visible=False)
-        )
-        self._data = self._mujoco.MjData(self._model)
+        self._take(0.0)
         self._rods = Plant(robot)  # for the shapes in which the chains start
         self._last: np.ndarray | None = None
 
@@ -92,8 +90,37 @@ class MuJoCoPlant:
     def reset(self, x: Any, guess: Equilibrium | None = None) -> None:
         """Put the chains in equilibrium at x on the branch of ``guess``, or on that of least energy (None)."""
         x = checked_vector("x", x, self.n_states)
+        if self.payload:
+            self._take(0.0)
         self._rods.reset(x, guess)
         self._settle(x)
+
+    def carry(self, payload: float, x: Any) -> np.ndarray:
+        """Let the tip carry a payload from state x on; see `Plant.carry`. The pin passes the impulse on to the chains.
+
+        Parameters
+        ----------
+        payload : float
+            All that is carried from now on [kg].
+        x : array_like, shape (4 + n,)
+            State [m, m/s, rad].
+
+        Returns
+        -------
+        ndarray, shape (4 + n,)
+            State just after.
+        """
+        payload = checked_number("payload", payload, minimum=0.0)
+        x = checked_vector("x", x, self.n_states)
+        if self._last is None or (x != self._last).any():
+            self._settle(x)
+        share = min(1.0, (self.robot.tip_mass + self.payload) / (self.robot.tip_mass + payload))
+        before = self._data
+        self._take(payload)
+        self._data.qpos[:], self._data.qvel[:] = before.qpos, before.qvel
+        self._data.qvel[-2:] *= share
+        self._last = np.concatenate([x[:2], self._data.qvel[-2:], x[4:]])
+        return self._last.copy()
 
     def step(self, x: Any, u: Any, f_ext: Any = (0.0, 0.0)) -> np.ndarray:
         """Advance by one time step with the motor rates held.
@@ -131,6 +158,14 @@ class MuJoCoPlant:
             raise
         self._last = np.concatenate([self._data.qpos[-2:], self._data.qvel[-2:], q + self.dt * rate])
         return self._last.copy()
+
+    def _take(self, payload: float) -> None:
+        self.payload = payload
+        loaded = replace(self.robot, tip_mass=self.robot.tip_mass + payload)
+        self._model = self._mujoco.MjModel.from_xml_string(
+            mjcf(loaded, links=self.links, timestep=self.dt / self.substeps, visible=False)
+        )
+        self._data = self._mujoco.MjData(self._model)
 
     def _settle(self, x: np.ndarray) -> None:
         state = settled_chains(self._rods.equilibrium(x), x[2:4], self.links)

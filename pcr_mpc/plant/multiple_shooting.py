@@ -95,7 +95,7 @@ def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = N
     weights = ca.vertcat(1, 1 / load, 1 / load, 1 / ca.sqrt(load))
     norm = ca.norm_2(ca.vertcat(*(weights * gap for gap in gaps), position, weights[3] * moment))
 
-    sweep = Sweep(ends, z)
+    sweep = Sweep([ca.jacobian(end[:6], node) for end, node in zip(ends, z, strict=True)])
     # Column 0 is the Newton step; the others start from a moved or turned base.
     first = ca.DM([[1, 0, 0, 0]])
     steps_at_nodes = [ca.vertcat(0, 0, gap) @ first for gap in gaps]
@@ -126,17 +126,14 @@ class Sweep:
 
     Parameters
     ----------
-    ends : list of casadi columns
-        [dx, dy, theta, n_x, n_y, m, ...] at the end of each segment (see `rod.propagation`).
-    starts : list of casadi columns
-        [theta, n_x, n_y, m] at its start, on which the end depends.
+    jacobians : list of casadi, shape (6, 4)
+        Of [dx, dy, theta, n_x, n_y, m] at the end of each segment (see `rod.propagation`) in [theta, n_x, n_y, m] at
+        its start.
     """
 
-    def __init__(self, ends: list[Any], starts: list[Any]) -> None:
-        self._transitions = [
-            ca.horzcat(ca.vertcat(ca.SX.eye(2), ca.SX(4, 2)), ca.jacobian(end[:6], start))
-            for end, start in zip(ends, starts, strict=True)
-        ]
+    def __init__(self, jacobians: list[Any]) -> None:
+        moved = ca.vertcat(ca.SX.eye(2), ca.SX(4, 2))
+        self._transitions = [ca.horzcat(moved, jacobian) for jacobian in jacobians]
         # T of every node and of the tip, and what makes the rows of T_{j+1} Phi_j orthonormal.
         self._rows: list[Any] = [ca.vertcat(ca.SX.eye(6)[:2, :], ca.SX.eye(6)[5, :])]
         self._turns: list[Any] = []

@@ -165,6 +165,11 @@ class Robot:
         """Return the same robot without gravity."""
         return replace(self, gravity=(0.0, 0.0))
 
+    def plain(self) -> Robot:
+        """Return the same robot with rods that are straight, uniform and inextensible; they keep their weight."""
+        rods = (replace(r, curvature=0.0, stiffness_factors=(1.0,), axial_stiffness=math.inf) for r in self.rods)
+        return replace(self, rods=tuple(rods))
+
     @cached_property
     def bases(self) -> np.ndarray:
         """Motor axes, shape (n, 2) [m]."""

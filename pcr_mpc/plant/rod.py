@@ -34,10 +34,13 @@ class Layout:
         Equal pieces of the rod on each of which its properties are linear in s; 0 if they do not change.
     varying : bool
         Whether EI changes along the rod.
+    stretching : bool
+        Whether it stretches.
     """
 
     intervals: int
     varying: bool
+    stretching: bool
 
     @property
     def size(self) -> int:
@@ -110,8 +113,8 @@ def rod_ode(state: Any, here: _Here | None = None) -> Any:
 
 def unpacked(layout: Layout, physics: Any) -> tuple[Any, Any, Any, Any]:
     """Weight (2), compliance, curvature and stiffness at the knots (None where it does not vary), from one vector."""
-    knots = layout.intervals + 1
-    return physics[:2], physics[2], physics[3 : 3 + knots], physics[3 + knots :] if layout.varying else None
+    knots, compliance = layout.intervals + 1, physics[2] if layout.stretching else 0.0
+    return physics[:2], compliance, physics[3 : 3 + knots], physics[3 + knots :] if layout.varying else None
 
 
 def interpolated(values: Any, s: Any) -> Any:

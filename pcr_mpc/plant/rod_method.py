@@ -202,5 +202,5 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
 
 def inlined(function: Any, of_rod: Any) -> Any:
     """Inline the graph of a rod into that of a robot that calls it, if it is small."""
-    small = of_rod.n_instructions() <= _INLINED_INSTRUCTIONS
+    small = of_rod.is_a("SXFunction") and of_rod.n_instructions() <= _INLINED_INSTRUCTIONS
     return function.expand(function.name(), {"cse": True}) if small else function

@@ -36,7 +36,11 @@ def robot_physics(robot: Robot) -> tuple[RodPhysics, ...] | None:
             f"grid of at most {_MOST_INTERVALS} intervals; give lists of equal length",
             key="curvature",
         )
-    layout = Layout(0 if constant else intervals, any(set(rod.stiffness_factors) != {1.0} for rod in robot.rods))
+    layout = Layout(
+        intervals=0 if constant else intervals,
+        varying=any(set(rod.stiffness_factors) != {1.0} for rod in robot.rods),
+        stretching=any(rod.stretches for rod in robot.rods),
+    )
     return tuple(_of_rod(rod, robot.gravity, layout) for rod in robot.rods)
 
 

@@ -20,6 +20,7 @@ from functools import lru_cache
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from .multiple_shooting import Sweep
 from .rod import Layout, propagation, rod_ode, runge_kutta
@@ -30,6 +31,8 @@ _PAIRS = [[a, b] for b in range(3) for a in range(b + 1)]  # of poses, as column
 @lru_cache
 def rod_mass(segments: int, steps: int, scheme: str, layout: Layout | None = None) -> Any:
     """Graph of one rod of unit length and unit line density.
+
+    It calls the same small graphs for all segments: written out, a C compiler takes minutes for it (see `compiled`).
 
     Parameters
     ----------
@@ -42,38 +45,63 @@ def rod_mass(segments: int, steps: int, scheme: str, layout: Layout | None = Non
         (nodes (4N) of an equilibrium, clamp angle), with a layout also the rod's numbers -> inertia M (3, 3) in
         (v, q'), and d vec(M) / d(p, q) (9, 3).
     """
-    h = 1.0 / segments
-    flat, angle = ca.SX.sym("nodes", 4 * segments), ca.SX.sym("angle")
-    physics = ca.SX.sym("physics", layout.size if layout else 0)
-    starts = [flat[4 * j : 4 * j + 4] for j in range(segments)]
-    starts[0] = ca.vertcat(angle, flat[1:4])
-    known = [() if layout is None else (j * h, physics) for j in range(segments)]
-    ends = [propagation(steps, scheme, layout)(z, h, *more) for z, more in zip(starts, known, strict=True)]
-    sweep, nothing = Sweep(ends, starts), [ca.SX(6, 3)] * segments
-    firsts = sweep.solve(ca.diagcat(0, 0, 1), ca.diagcat(1, 1, 0), nothing)
-    along = _variations(steps, scheme, layout)
-    alone = [along(z, first, ca.SX(6, 6), h, *more)[0] for z, first, more in zip(starts, firsts, known, strict=True)]
-    seconds = sweep.solve(ca.SX(3, 6), ca.SX(3, 6), alone)
-    mass, products = ca.SX(3, 3), ca.SX(6, 3)
-    for z, first, second, more in zip(starts, firsts, seconds, known, strict=True):
-        _, of_mass, of_products = along(z, first, second, h, *more)
-        mass += of_mass
-        products += of_products
+    flat, angle = ca.MX.sym("nodes", 4 * segments), ca.MX.sym("angle")
+    physics = ca.MX.sym("physics", layout.size if layout else 0)
+    starts = ca.reshape(ca.vertcat(angle, flat[1:]), 4, segments)
+    at = ca.DM(np.arange(segments) / segments).T
+    known = [] if layout is None else [at, ca.repmat(physics, 1, segments)]
+    jacobian, alone, integrals = (graph.map(segments) for graph in _segment(1.0 / segments, steps, scheme, layout))
+    first_sweep, second_sweep = _sweeps(segments)
+    jacobians = jacobian(starts, *known)
+    firsts = first_sweep(jacobians)
+    seconds = second_sweep(jacobians, alone(starts, firsts, *known))
+    together = ca.repmat(ca.DM.eye(3), segments, 1)  # the sum over blocks that stand side by side
+    mass, products = (pieces @ together for pieces in integrals(starts, firsts, seconds, *known))
 
     column = {pair: k for k, (a, b) in enumerate(_PAIRS) for pair in ((a, b), (b, a))}
     slopes = [
         [products[column[a, c], b] + products[column[b, c], a] for c in range(3)] for b in range(3) for a in range(3)
     ]
     arguments = [flat, angle, physics] if layout else [flat, angle]
-    results = [ca.densify(mass), ca.densify(ca.vertcat(*(ca.horzcat(*row) for row in slopes)))]
-    return ca.Function("rod_mass", arguments, results, {"cse": True})
+    return ca.Function("rod_mass", arguments, [mass, ca.vertcat(*(ca.horzcat(*row) for row in slopes))])
 
 
 @lru_cache
-def _variations(steps: int, scheme: str, layout: Layout | None) -> Any:
-    """Graph (z (4), y_a (6, 3), y_ab (6, 6), h[, s, physics]) -> y_ab at the end, int r_a . r_b, int r_ab . r_c."""
+def _sweeps(segments: int) -> tuple[Any, Any]:
+    """Graphs of what joins the segments, whose Jacobians stand side by side as all else does.
+
+    Returns
+    -------
+    first : casadi.Function
+        Jacobians (6, 4N) -> y_a at the starts of the segments (6, 3N).
+    second : casadi.Function
+        (Jacobians, gaps (6, 6N)) -> y_ab at the starts (6, 6N).
+    """
+    jacobians, gaps = ca.SX.sym("jacobians", 6, 4 * segments), ca.SX.sym("gaps", 6, 6 * segments)
+    sweep, nothing = Sweep(ca.horzsplit(jacobians, 4)), [ca.SX(6, 3)] * segments
+    firsts = sweep.solve(ca.diagcat(0, 0, 1), ca.diagcat(1, 1, 0), nothing)
+    seconds = sweep.solve(ca.SX(3, 6), ca.SX(3, 6), ca.horzsplit(gaps, 6))
+    return (
+        ca.Function("first_sweep", [jacobians], [ca.densify(ca.horzcat(*firsts))], {"cse": True}),
+        ca.Function("second_sweep", [jacobians, gaps], [ca.densify(ca.horzcat(*seconds))], {"cse": True}),
+    )
+
+
+@lru_cache
+def _segment(h: float, steps: int, scheme: str, layout: Layout | None) -> tuple[Any, Any, Any]:
+    """Graphs of a segment of length h from z = [theta, n_x, n_y, m] on; with a layout also of s and the rod's numbers.
+
+    Returns
+    -------
+    jacobian : casadi.Function
+        z -> derivatives of y at the end (6, 4) in z.
+    alone : casadi.Function
+        (z, y_a (6, 3)) -> y_ab at the end (6, 6) if it is zero at the start.
+    integrals : casadi.Function
+        (z, y_a (6, 3), y_ab (6, 6)) -> int r_a . r_b (3, 3), int r_ab . r_c (6, 3).
+    """
     z, first, second = ca.SX.sym("z", 4), ca.SX.sym("first", 6, 3), ca.SX.sym("second", 6, 6)
-    h, s, physics = ca.SX.sym("h"), ca.SX.sym("s"), ca.SX.sym("physics", layout.size if layout else 0)
+    s, physics = ca.SX.sym("s"), ca.SX.sym("physics", layout.size if layout else 0)
 
     def slope(state: Any, here: Any) -> Any:
         y, first, second, *_ = _split(state)
@@ -85,21 +113,28 @@ def _variations(steps: int, scheme: str, layout: Layout | None) -> Any:
         both = ca.vertcat(directions, others)
         bends = ca.horzcat(*(ca.substitute(bend, both, ca.vec(first[:, pair])) for pair in _PAIRS))
         rates, jacobian, bends = ca.substitute([rates, jacobian, bends], [symbol], [y])
-        moved = jacobian @ second + bends
         positions = first[:2, :]
         return ca.vertcat(
             rates,
             ca.vec(jacobian @ first),
-            ca.vec(moved),
+            ca.vec(jacobian @ second + bends),
             ca.vec(positions.T @ positions),
             ca.vec(second[:2, :].T @ positions),
         )
 
-    start = ca.vertcat(0, 0, z, ca.vec(first), ca.vec(second), ca.SX(9 + 18, 1))
-    end = runge_kutta(slope, start, h, steps, scheme, layout, s, physics)
-    _, _, seconds, mass, products = _split(end)
-    arguments = [z, first, second, h, s, physics] if layout else [z, first, second, h]
-    return ca.Function("variations", arguments, [seconds, mass, products], {"cse": True})
+    def end(second: Any) -> list[Any]:
+        start = ca.vertcat(0, 0, z, ca.vec(first), ca.vec(second), ca.SX(9 + 18, 1))
+        return [ca.densify(part) for part in _split(runge_kutta(slope, start, h, steps, scheme, layout, s, physics))]
+
+    known = [s, physics] if layout else []
+    of_rod = propagation(steps, scheme, layout)(z, h, *known)
+    _, _, alone, *_ = end(ca.SX(6, 6))
+    *_, mass, products = end(second)
+    return (
+        ca.Function("jacobian", [z, *known], [ca.densify(ca.jacobian(of_rod[:6], z))], {"cse": True}),
+        ca.Function("alone", [z, first, *known], [alone], {"cse": True}),
+        ca.Function("integrals", [z, first, second, *known], [mass, products], {"cse": True}),
+    )
 
 
 def _split(state: Any) -> list[Any]:

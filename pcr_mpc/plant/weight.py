@@ -11,6 +11,7 @@ centreline is that of the closed form (see `elastica`), its unknowns follow (p, 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from ..buffered import BufferedFunction
 from .elastica import pendulum
+from .equilibrium import Equilibrium
 from .robot import Robot
 
 WEIGHTS = ("none", "condensed", "exact")
@@ -45,6 +47,20 @@ class CondensedWeight:
     def second(self, unknowns: np.ndarray, q: np.ndarray) -> np.ndarray:
         """d2U_g/d(p, q)2, shape (2 + n, 2 + n) [N/m, N/rad, N m/rad]."""
         return np.asarray(self._evaluate(self._second, unknowns, q)[0].copy())
+
+    def added(self, eq: Equilibrium, unknowns: np.ndarray) -> Equilibrium:
+        """Return an equilibrium of weightless rods with the weight in everything but their shape."""
+        energy, slope = self.first(unknowns, eq.q)
+        curvature = self.second(unknowns, eq.q)
+        return replace(
+            eq,
+            force=eq.force + slope[:2],
+            dforce_dp=eq.dforce_dp + curvature[:2, :2],
+            dforce_dq=eq.dforce_dq + curvature[:2, 2:],
+            motor_torque=eq.motor_torque + slope[2:],
+            dtorque_dq=eq.dtorque_dq + np.diag(curvature)[2:],
+            energy=eq.energy + energy,
+        )
 
     @staticmethod
     def _evaluate(graph: BufferedFunction, unknowns: np.ndarray, q: np.ndarray) -> list[np.ndarray]:

@@ -26,6 +26,7 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"scene       {summary['scene']} ({summary['duration_s']:g} s)",
         f"controller  {summary['controller']}",
         f"plant       {summary['plant']}",
+        *_need_lines(summary["rung"], summary["need"]),
         "",
     ]
     tracking = [
@@ -62,6 +63,19 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"failures          {summary['failures']}",
     ]
     return "\n".join(lines)
+
+
+def _need_lines(rung: dict[str, Any] | None, need: dict[str, Any] | None) -> list[str]:
+    if need is None:
+        return []
+    physics = "another engine" if rung is None else ", ".join(
+        f"{name} {rung[name]}" for name in ("inertia", "weight", "rods", "payload") if rung[name]
+    )  # fmt: skip
+    tip = f"tip to {need['tip_accuracy_mm']:g} mm: "
+    tip += f"within {need['tip_error_mm']:.2g} mm" if need["verified"] else "not verified; see pcr-mpc choose"
+    slow = [name for name in ("plant_step", "control_step") if not need[f"{name}_met"]]
+    times = "in time" if not slow else ", ".join(f"{name.replace('_', ' ')} too slow" for name in slow)
+    return [f"rung        {physics}", f"need        {tip}; {times}"]
 
 
 def _percent(share: float | None) -> str:

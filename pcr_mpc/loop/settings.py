@@ -1,0 +1,176 @@
+"""Parts of a scene: how the plant is simulated, what is asked of it, and what the tip carries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
+from ..plant.inertia import INERTIAS
+from ..plant.robot import Robot
+from ..plant.rod import SCHEMES
+from ..plant.statics import METHODS, default_method
+from ..plant.weight import WEIGHTS
+from ..toml_table import Table
+
+RODS = ("plain", "as_built")
+PAYLOADS = ("ignored", "carried")
+_SAME_TIME = 1e-9  # s
+
+
+@dataclass(frozen=True)
+class PlantSettings:
+    """How the plant is simulated: the arguments of `Plant`, and what of the robot and the scene is left out.
+
+    Attributes
+    ----------
+    method, segments, steps, scheme, integrator, dt, on_snap, inertia, weight
+        See `Plant`.
+    rods : {"plain", "as_built"}
+        Without or with curvature at rest, stiffness along the rods and stretch.
+    payload : {"ignored", "carried"}
+    """
+
+    method: str
+    segments: int
+    steps: int
+    scheme: str
+    integrator: str
+    dt: float
+    on_snap: str
+    inertia: str = "none"
+    weight: str | None = None
+    rods: str = "as_built"
+    payload: str = "carried"
+
+    def make(self, robot: Robot) -> Plant:
+        """Build the plant of a robot; errors as `Plant`."""
+        return Plant(
+            robot.plain() if self.rods == "plain" else robot,
+            method=self.method,
+            segments=self.segments,
+            steps=self.steps,
+            scheme=self.scheme,
+            integrator=self.integrator,
+            dt=self.dt,
+            on_snap=self.on_snap,
+            inertia=self.inertia,
+            weight=self.weight,
+        )
+
+    def describes(self, plant: object) -> bool:
+        """Whether a plant is simulated like this."""
+        if not isinstance(plant, Plant):
+            return False
+        own = self.method, self.integrator, self.dt, self.inertia
+        return own == (plant.method, plant.integrator, plant.dt, plant.inertia)
+
+
+@dataclass(frozen=True)
+class Need:
+    """What is asked of the simulation of a scene.
+
+    Attributes
+    ----------
+    tip_accuracy : float
+        Largest error of the tip over the duration [m], motors moving as they do.
+    plant_step, control_step : float
+        Time that a step may take, median [s].
+    """
+
+    tip_accuracy: float
+    plant_step: float
+    control_step: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What `pcr-mpc choose` found about the rung that stands in the scene's [plant] table.
+
+    Attributes
+    ----------
+    tip_error : float
+        [m], the yardstick's own uncertainty included.
+    estimated : float
+        The part of it that is estimated, not measured [m].
+    digest : str
+        Of all that it rests on (see `finding.digest`).
+    """
+
+    tip_error: float
+    estimated: float
+    digest: str
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What the tip picks up, at rest, and puts down again.
+
+    Attributes
+    ----------
+    mass : float
+        [kg].
+    pick, place : float
+        When [s].
+    """
+
+    mass: float
+    pick: float
+    place: float
+
+    def carried(self, t: np.ndarray) -> np.ndarray:
+        """Mass that the tip carries from the times t on [kg], same shape."""
+        # Times are sums of steps: rounding must not decide.
+        return np.where((t > self.pick - _SAME_TIME) & (t < self.place - _SAME_TIME), self.mass, 0.0)
+
+
+def read_plant(table: Table, robot: Robot) -> PlantSettings:
+    """Take the keys of a scene's [plant] table."""
+    rods = table.text("rods", RODS[-1], choices=RODS)
+    default = default_method(robot.plain() if rods == "plain" else robot)
+    plant = PlantSettings(
+        method=table.text("method", default, choices=METHODS),
+        segments=table.integer("segments", 8),
+        steps=table.integer("steps", 1),
+        scheme=table.text("scheme", "rk8", choices=tuple(SCHEMES)),
+        integrator=table.text("integrator", choices=(*INTEGRATORS, "gauss")),
+        dt=table.number("dt", above=0.0),
+        on_snap=table.text("on_snap", "raise", choices=ON_SNAP),
+        inertia=table.text("inertia", "none", choices=INERTIAS),
+        weight=table.text("weight", None, choices=WEIGHTS),
+        rods=rods,
+        payload=table.text("payload", PAYLOADS[-1], choices=PAYLOADS),
+    )
+    if (plant.inertia == "full") != (plant.integrator == "gauss"):
+        raise table.fail("integrator", f"is {plant.integrator}: inertia 'full' needs 'gauss', and only it does")
+    if plant.inertia != "none" and plant.method == "single_shooting":
+        raise table.fail("inertia", f"is {plant.inertia}, which method 'single_shooting' does not know")
+    return plant
+
+
+def read_payload(file: Table) -> Payload | None:
+    """Take a scene's [payload] table, if it has one."""
+    if not file.has("payload"):
+        return None
+    with file.table("payload") as table:
+        pick = table.number("pick", minimum=0.0)
+        return Payload(table.number("mass", above=0.0), pick, table.number("place", above=pick))
+
+
+def read_need(file: Table) -> Need | None:
+    """Take a scene's [need] table, if it has one."""
+    if not file.has("need"):
+        return None
+    with file.table("need") as table:
+        numbers = [table.number(key, above=0.0) for key in ("tip_accuracy", "plant_step", "control_step")]
+        return Need(1e-3 * numbers[0], 1e-6 * numbers[1], 1e-6 * numbers[2])
+
+
+def read_finding(file: Table) -> Finding | None:
+    """Take a scene's [chosen] table, if it has one."""
+    if not file.has("chosen"):
+        return None
+    with file.table("chosen") as table:
+        tip_error = 1e-3 * table.number("tip_error", minimum=0.0)
+        return Finding(tip_error, 1e-3 * table.number("estimated", minimum=0.0), table.text("digest"))
