@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from experiments.charts import statics
-from experiments.charts.motion import swing, yardstick
 from experiments.charts.points import about
+from experiments.charts.release import swing, yardstick
 from experiments.charts.statics import LITERAL_AT_ONCE
 from experiments.rod_inertia import STEP, furthest, start
 from pcr_mpc import Plant, Robot, linearise, load_robot, load_scene, load_tuning, make_controller, simulate
@@ -133,7 +133,7 @@ def show(found: list[Change], *, markdown: bool = False) -> str:
     """Table for the terminal or for CHANGELOG.md."""
 
     def number(value: float | None) -> str:
-        return "-" if value is None else f"{value:.3g}"
+        return "-" if value is None else f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
     if markdown:
         lines = [f"| {one.name} | {number(one.old)} | {number(one.new)} |" for one in found]

@@ -63,9 +63,15 @@ class Case:
     believed: Robot
 
 
+def general(name: str) -> Scene:
+    """Scene with a general tuning instead of its own: period and horizon are to be the same for every controller."""
+    tuning = "slow_motors" if name == "limited" else "default"
+    return load_scene(SCENES / f"{name}.toml").tuned(load_tuning(ROOT / "controllers" / f"{tuning}.toml"))
+
+
 def cases() -> dict[str, Case]:
     """All cases by name."""
-    lemniscate = load_scene(SCENES / "lemniscate.toml")
+    lemniscate = general("lemniscate")
     robot = lemniscate.robot
 
     def stiffer(factor: float) -> Robot:
@@ -78,7 +84,7 @@ def cases() -> dict[str, Case]:
         return Case(panel, replace(lemniscate, **changes), robot)
 
     def scene_of(name: str) -> Case:
-        scene = load_scene(SCENES / f"{name}.toml")
+        scene = general(name)
         return Case(name.replace("_", " "), scene, scene.robot)
 
     off = "EI or mass off by 20 %"
@@ -97,7 +103,7 @@ def cases() -> dict[str, Case]:
 
 
 def build(label: str, case: Case) -> Controller:
-    """Controller by its label, with the horizon that the scene's own tuning has."""
+    """Controller by its label, with the horizon of the scene's tuning."""
     assert case.scene.tuning is not None
     tuning: Tuning = load_tuning(ROOT / "controllers" / f"{CONTROLLERS[label][0]}.toml")
     if tuning.law.endswith("mpc"):

@@ -76,9 +76,9 @@ def plot(choices: list[Choice], path: Path) -> None:
         axes.plot(1e6 * run.step_time, 1e3 * run.error, "*", color="black", ms=9, mec="white", mew=0.6, zorder=5)
         allowed = 1e3 * need.tip_accuracy
         axes.axhline(allowed, color=GREY, ls="--", lw=1.2)
-        style = {"ha": "right", "va": "top", "fontsize": 9, "color": "#444444"}
+        style = {"ha": "right", "va": "top", "fontsize": 8.5, "color": "#444444"}
         axes.annotate(f"need {allowed:g} mm", (0.98, allowed), xycoords=("axes fraction", "data"), **style)
-        axes.set(xscale="log", yscale="log", title=choice.scene.name, xlim=(20, 2e4), ylim=(FLOOR / 2, 2e2))
+        axes.set(xscale="log", yscale="log", title=choice.scene.name, xlim=(15, 6e4), ylim=(FLOOR / 2, 2e2))
         axes.tick_params(labelbottom=True)
     for axes in panels[:, 0]:
         axes.set_ylabel("largest tip error [mm]")

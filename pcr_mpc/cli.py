@@ -163,6 +163,7 @@ def _parser() -> argparse.ArgumentParser:
                       "(default SQLite in results/tune/SCENE)")  # fmt: skip
     tuning.add_argument("--episodes", type=int, default=24, help="with mismatch, in each trial (default 24: a "
                         "study that sees no failure, which is rare, takes a fragile tuning for the best)")  # fmt: skip
+    tuning.add_argument("--keep-period", action="store_true", help="the control period is given: search the rest")
     tuning.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
     tuning.add_argument(
         "--out", type=Path, metavar="FILE", help="tuning to write (default SCENE.toml beside the scene's)"
@@ -246,7 +247,7 @@ def _tune(options: argparse.Namespace) -> int:
     folder = Path("results") / "tune" / scene.name
     folder.mkdir(parents=True, exist_ok=True)
     storage = options.storage or f"sqlite:///{folder / 'study.db'}"
-    search = Search(lighter(scene), Spread(), options.episodes, options.seed, storage, known)
+    search = Search(lighter(scene), Spread(), options.episodes, options.seed, storage, known, options.keep_period)
     with local_workers(options.jobs) as executor:
         chosen = tune(search, options.trials, executor)
     trials = finished_trials(search)

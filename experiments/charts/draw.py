@@ -92,4 +92,6 @@ def draw_legend(panel: Any, rows: list[Row], look: Look, note: str, *, floor: bo
         handles.append(plt.Line2D([], [], color=GREY, marker="o", ls="", mec="black", mew=1.2,
                                   label="black rim: closer than that, drawn on it"))  # fmt: skip
     panel.axis("off")
-    panel.legend(handles=handles, loc="center", fontsize=9.5, title=note, title_fontsize=9.5, alignment="left")
+    panel.legend(
+        handles=handles, loc="center", fontsize=9, labelspacing=0.25, title=note, title_fontsize=9.5, alignment="left"
+    )

@@ -6,8 +6,8 @@ with massless rods. The error is the largest distance from rods of distributed m
 (at any step, where that is longer). How well these are known themselves - what two modes fewer and twice the step
 change - is the row "yardstick", and nobody can be seen to be better.
 
-Times are of blocks of 10 ms, scaled to a second. The loop over segments of the literal reading is timed over a few
-steps only; its error is that of the same equations integrated all at once.
+Times are of blocks of 10 ms, scaled to a second; in one call, of the call. The loop over segments of the literal
+reading is timed over a few steps only; its error is that of the same equations integrated all at once.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from importlib.util import find_spec
 import numpy as np
 
 from experiments.charts.points import Key, Row, times
+from experiments.charts.release import FINEST, MODES, error_of, failed, succeeded, swing, yardstick
 from experiments.charts.statics import LITERAL, LITERAL_AT_ONCE
 from experiments.literal_reading import LiteralReading, Solution
 from experiments.rod_inertia import RELEASES, STEP, start
-from pcr_mpc import Equilibrium, PCRError, Plant, Robot
+from pcr_mpc import PCRError, Plant, Robot
 from pcr_mpc.loop.simulated_plant import SimulatedPlant
+from pcr_mpc.plant.rollout import rollout
 
 YARDSTICK, MUJOCO, ELASTICA = "yardstick", "MuJoCo", "PyElastica"
-_BLOCK = 1e-2  # s, whose wall time is one measurement
-_MODES, _FEWER_MODES, _FINEST = 14, 12, STEP / 2
+_REPEATS = 5  # of a release in one call
 _EVALUATIONS = {"semi_implicit_euler": 1, "velocity_verlet": 1, "rk4": 4, "gauss": 1}
 
 
@@ -41,10 +42,12 @@ class Plan:
     ----------
     duration : float
         Of a release [s].
-    steps : dict
-        Integrator -> time steps [s].
+    steps : tuple of (str, tuple of float)
+        Integrators and their time steps [s].
     inertias : tuple of str
         With these integrators.
+    in_one_call : tuple of (str, float)
+        Integrators and steps with which a whole release is one call of `rollout`, interpreted and compiled.
     full : tuple of (int, float)
         Modes and step [s] of rods with distributed mass.
     links : tuple of int
@@ -64,6 +67,7 @@ class Plan:
         ("rk4", (5e-4, 1e-3, 2e-3, 5e-3, 1e-2)),
     )
     inertias: tuple[str, ...] = ("none", "constant", "condensed")
+    in_one_call: tuple[tuple[str, float], ...] = (("velocity_verlet", 1e-3), ("rk4", 1e-3), ("rk4", 5e-3))
     full: tuple[tuple[int, float], ...] = ((6, 1e-3), (8, 1e-3), (8, 2e-3), (10, 1e-3), (12, 1e-3), (12, 2e-3))
     links: tuple[int, ...] = (10, 20, 40, 80)
     alone: tuple[tuple[str, int, float], ...] = (
@@ -75,7 +79,8 @@ class Plan:
 
 
 QUICK = Plan(
-    0.1, (("semi_implicit_euler", (1e-3,)), ("velocity_verlet", (1e-3,)), ("rk4", (1e-3, 2e-3))), full=((8, 1e-3),),
+    0.1, (("semi_implicit_euler", (1e-3,)), ("velocity_verlet", (1e-3,)), ("rk4", (1e-3, 2e-3))),
+    in_one_call=(("rk4", 2e-3),), full=((8, 1e-3),),
     links=(10, 40), alone=(("implicitfast", 40, 2e-5),), elements=((20, 4e-3),), literal_steps=3,
 )  # fmt: skip
 
@@ -85,7 +90,7 @@ def points(robot: Robot, plan: Plan) -> dict[Key, Callable[[], Row]]:
     found: dict[Key, Callable[[], Row]] = {}
     for release in RELEASES:
         at = partial(_measured, robot, release, plan.duration)
-        found[release, YARDSTICK, f"{_MODES} modes, {1e3 * _FINEST:g} ms"] = partial(
+        found[release, YARDSTICK, f"{MODES} modes, {1e3 * FINEST:g} ms"] = partial(
             _yardstick, robot, release, plan.duration
         )
         for inertia in plan.inertias:
@@ -93,6 +98,11 @@ def points(robot: Robot, plan: Plan) -> dict[Key, Callable[[], Row]]:
                 for dt in steps:
                     plant = partial(Plant, robot, inertia=inertia, integrator=integrator, dt=dt)
                     found[release, inertia, f"{integrator}, {1e3 * dt:g} ms"] = partial(at, plant)
+            for integrator, dt in plan.in_one_call:
+                for how in ("in one call", "in one call, compiled"):
+                    plant = partial(Plant, robot, inertia=inertia, integrator=integrator, dt=dt, compiled="," in how)
+                    key = release, inertia, f"{integrator}, {1e3 * dt:g} ms, {how}"
+                    found[key] = partial(_in_one_call, robot, release, plan.duration, plant)
         for modes, dt in plan.full:
             plant = partial(Plant, robot, inertia="full", modes=modes, integrator="gauss", dt=dt)
             found[release, "full", f"{modes} modes, gauss, {1e3 * dt:g} ms"] = partial(at, plant)
@@ -126,69 +136,9 @@ def _peers(robot: Robot, release: str, plan: Plan) -> dict[Key, Callable[[], Row
     return found
 
 
-@lru_cache(maxsize=4)
-def yardstick(robot: Robot, release: str, duration: float) -> tuple[np.ndarray, float, Row]:
-    """Tips every half millisecond [m], how well they are known [mm], and the times."""
-    pose, x = start(robot, release)
-
-    def full(modes: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        return swing(Plant(robot, inertia="full", modes=modes, integrator="gauss", dt=dt), pose, x, duration)
-
-    tips, seconds = full(_MODES, _FINEST)
-    by_step = _distance(tips[::2], full(_MODES, STEP)[0])
-    by_modes = _distance(tips, full(_FEWER_MODES, _FINEST)[0])
-    return tips, by_step + by_modes, times(seconds)
-
-
-def swing(
-    plant: SimulatedPlant,
-    pose: Equilibrium,
-    x: np.ndarray,
-    duration: float,
-    clock: Callable[[], float] = time.perf_counter,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Tips after every step, shape (K + 1, 2) [m], and times of blocks, for a simulated second [s]."""
-    plant.reset(x, pose)
-    motors, per_block = np.zeros(pose.robot.n_rods), round(_BLOCK / plant.dt)
-    plant.step(x, motors)  # warms up
-    plant.reset(x, pose)
-    tips, seconds = [x[:2]], []
-    for _ in range(round(duration / _BLOCK)):
-        began = clock()
-        for _ in range(per_block):
-            x = plant.step(x, motors)
-            tips.append(x[:2])
-        seconds.append((clock() - began) / _BLOCK)
-    return np.array(tips), np.array(seconds)
-
-
-def _distance(tips: np.ndarray, others: np.ndarray) -> float:
-    return 1e3 * float(np.linalg.norm(tips - others, axis=1).max())
-
-
-def _error(robot: Robot, release: str, duration: float, tips: np.ndarray, dt: float) -> float:
-    """Largest distance from the yardstick [mm] at multiples of the longer of dt and 1 ms."""
-    right = yardstick(robot, release, duration)[0]
-    every = max(1, round(STEP / dt))
-    spacing = round(every * dt / _FINEST)
-    return _distance(tips[::every], right[::spacing])
-
-
-def _row(robot: Robot, release: str, duration: float, error: float, remark: str = "", **others: object) -> Row:
-    unknown = yardstick(robot, release, duration)[1]
-    if error < unknown:
-        remark += f" closer than the yardstick is known, {unknown:.1e} mm"
-    done: Row = {"ours": True, "success": 1, "attempts": 1, "error": error, "error_max": error}
-    return done | others | {"remark": remark.strip()}
-
-
-def _failed(failure: PCRError, *, ours: bool) -> Row:
-    return {"ours": ours, "success": 0, "attempts": 1, "remark": f"{type(failure).__name__}: {failure}"}
-
-
 def _yardstick(robot: Robot, release: str, duration: float) -> Row:
     _, unknown, seconds = yardstick(robot, release, duration)
-    return _row(robot, release, duration, unknown, "what two modes fewer and twice the step change", **seconds)
+    return succeeded(robot, release, duration, unknown, "what two modes fewer and twice the step change", **seconds)
 
 
 def _measured(robot: Robot, release: str, duration: float, make: partial[SimulatedPlant]) -> Row:
@@ -198,10 +148,27 @@ def _measured(robot: Robot, release: str, duration: float, make: partial[Simulat
         plant = make()
         tips, seconds = swing(plant, pose, x, duration)
     except PCRError as failure:
-        return _failed(failure, ours=ours)
-    error = _error(robot, release, duration, tips, plant.dt)
+        return failed(failure, ours=ours)
+    error = error_of(robot, release, duration, tips, plant.dt)
     evaluations = (len(tips) - 1) * (_EVALUATIONS[plant.integrator] if isinstance(plant, Plant) else 6)
-    return _row(robot, release, duration, error, **times(seconds), ours=ours, evaluations=evaluations)
+    return succeeded(robot, release, duration, error, **times(seconds), ours=ours, evaluations=evaluations)
+
+
+def _in_one_call(robot: Robot, release: str, duration: float, make: partial[Plant]) -> Row:
+    pose, x = start(robot, release)
+    plant, seconds = make(), []
+    motors = np.zeros((round(duration / plant.dt), robot.n_rods))
+    try:
+        rollout(plant, x, motors, guess=pose)  # builds the graph
+        for _ in range(_REPEATS):
+            began = time.perf_counter()
+            tips = rollout(plant, x, motors, guess=pose).x[:, :2]
+            seconds.append((time.perf_counter() - began) / duration)
+    except PCRError as failure:
+        return failed(failure, ours=True)
+    error = error_of(robot, release, duration, tips, plant.dt)
+    evaluations = len(motors) * _EVALUATIONS[plant.integrator]
+    return succeeded(robot, release, duration, error, **times(seconds), evaluations=evaluations)
 
 
 def _engine_alone(robot: Robot, release: str, duration: float, integrator: str, links: int, dt: float) -> Row:
@@ -214,11 +181,13 @@ def _engine_alone(robot: Robot, release: str, duration: float, integrator: str, 
     try:
         tips, spent = engine_alone(robot, release, links, dt, integrator, duration)
     except PCRError as failure:
-        return _failed(failure, ours=False)
+        return failed(failure, ours=False)
     finally:
         mujoco.set_mju_user_warning(complaints)
-    error = _error(robot, release, duration, tips, STEP)
-    return _row(robot, release, duration, error, **times([spent / duration]), ours=False, evaluations=duration / dt)
+    error = error_of(robot, release, duration, tips, STEP)
+    return succeeded(
+        robot, release, duration, error, **times([spent / duration]), ours=False, evaluations=duration / dt
+    )
 
 
 def _elastica(robot: Robot, release: str, duration: float, elements: int, radius: float) -> Row:
@@ -226,13 +195,13 @@ def _elastica(robot: Robot, release: str, duration: float, elements: int, radius
 
     release_tip(robot, release, elements, radius, STEP)  # compiles
     tips, spent = release_tip(robot, release, elements, radius, duration)
-    error = _error(robot, release, duration, tips, STEP)
-    return _row(robot, release, duration, error, **times([spent / duration]), ours=False)
+    error = error_of(robot, release, duration, tips, STEP)
+    return succeeded(robot, release, duration, error, **times([spent / duration]), ours=False)
 
 
 def _literal(robot: Robot, release: str, duration: float, steps: int | None = None) -> Row:
     tips, seconds, evaluations = _literal_at_once(robot, release, duration)
-    error = _error(robot, release, duration, tips, STEP)
+    error = error_of(robot, release, duration, tips, STEP)
     remark = ""
     if steps is not None:
         walk = _walk(LiteralReading(robot), robot, release)
@@ -244,7 +213,7 @@ def _literal(robot: Robot, release: str, duration: float, steps: int | None = No
             spent.append((time.perf_counter() - began) / STEP)
         seconds = np.array(spent)
         remark = f"extrapolated from {steps} steps; the error is that of the same equations at once"
-    return _row(
+    return succeeded(
         robot, release, duration, error, remark, **times(seconds), ours=False, iterations=1, evaluations=evaluations
     )
 

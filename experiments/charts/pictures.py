@@ -75,7 +75,7 @@ def draw_control(rows: list[Row], path: Path) -> None:
         draw_points(panel, mine, CONTROL)
         draw_front(panel, mine, CONTROL.unit)
         panel.set(xscale="log", yscale="log", xlabel="wall time of a control step, p50 to p99 [ms]", title=case)
-        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5)))
         panel.yaxis.set_major_formatter("{x:g}")
         panel.yaxis.set_minor_formatter(NullFormatter())
     axes[0].set_ylabel("RMS tracking error after 1 s [mm]")
@@ -102,6 +102,8 @@ def _segments_tag(row: Row) -> str:
 
 def _of_motion(row: Row) -> str:
     name, settings = str(row["method"]), str(row["settings"])
+    if "in one call" in settings:
+        return f"{name}, {settings.split(', ', 2)[2]}"
     if name in _INERTIAS:
         return f"{name}, {_INTEGRATORS[settings.split(',')[0]][0]}"
     if name == MUJOCO:
@@ -115,7 +117,7 @@ def _motion_tag(row: Row) -> str:
 
 
 def _motion_line(row: Row) -> str:
-    joined = row["method"] in _INERTIAS or "extrapolated" in row["settings"]
+    joined = (row["method"] in _INERTIAS and "in one call" not in row["settings"]) or "extrapolated" in row["settings"]
     return "by step" if joined else ""
 
 
@@ -170,8 +172,13 @@ MOTION = Look(
         for name, marker, size in _INTEGRATORS.values()
     }
     | {
-        "none, multiple shooting": (BLUE, ">", 6),
-        "none, single shooting": (BLUE, "<", 6),
+        f"{inertia}, {how}": (colour, marker, 6)
+        for inertia, colour in _INERTIAS.items()
+        for how, marker in (("in one call", "<"), ("in one call, compiled", "p"))
+    }
+    | {
+        "none, multiple shooting": (BLUE, "^", 6),
+        "none, single shooting": (BLUE, "v", 6),
         "full, Gauss (number: modes)": (GREY, "P", 6),
         _EXTRAPOLATED: (SKY, "^", 6),
         _ALONE: (SKY, "x", 5),

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from pcr_mpc.loop.machine import machine
 from pcr_mpc.loop.provenance import commit
-from pcr_mpc.loop.timing import machine
 
 Row = dict[str, Any]
 Key = tuple[str, str, str]
@@ -133,15 +133,8 @@ def _parsed(row: Row) -> Row:
 
 def _machine() -> str:
     found, threads = machine(), os.environ.get("OPENBLAS_NUM_THREADS", "all")
-    return f"{_processor()}, {found['cores']} cores, {threads} thread(s) in BLAS, load {found['load']:.1f} at the start"
-
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            return next(line.split(":")[1].strip() for line in file if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+    busy = f"load {found['load']:.1f} at the start"
+    return f"{found['processor']}, {found['cores']} cores, {threads} thread(s) in BLAS, {busy}"
 
 
 def _versions() -> str:

@@ -61,6 +61,8 @@ class Search:
         URL of Optuna's storage.
     known : Tuning or None
         That an earlier search has found for the scene: the first guess.
+    keep_period : bool
+        The control period is given, by a bus or a camera.
     """
 
     scene: Scene
@@ -69,6 +71,7 @@ class Search:
     seed: int
     storage: str
     known: Tuning | None = None
+    keep_period: bool = False
 
     @property
     def start(self) -> Tuning:
@@ -102,7 +105,7 @@ def parameters(search: Search, tuning: Tuning) -> dict[str, Any]:
     if search.start.observer is not None:
         observer = tuning.observer or search.start.observer
         params |= {"force_noise": observer.force_noise, "force_walk": observer.force_walk}
-    if len(_periods(search.scene)) > 1:
+    if len(_periods(search)) > 1:
         params["period"] = tuning.period or search.scene.period
     return params
 
@@ -125,7 +128,7 @@ def space(search: Search) -> dict[str, BaseDistribution]:
             choices: dict[str, Any] = {
                 "weigh_velocity": (False, True),
                 "linearise": LINEARISE,
-                "period": _periods(search.scene),
+                "period": _periods(search),
             }
             found[name] = distributions.CategoricalDistribution(choices[name])
     return found
@@ -166,9 +169,10 @@ def candidate(search: Search, params: dict[str, Any]) -> Tuning:
     )
 
 
-def _periods(scene: Scene) -> list[float]:
+def _periods(search: Search) -> list[float]:
     """Control periods that the plant's step divides; a known delay and a deadline are those of one period only."""
-    if scene.delay or math.isfinite(scene.deadline):
+    scene = search.scene
+    if search.keep_period or scene.delay or math.isfinite(scene.deadline):
         return [scene.period]
     ratios = {period: period / scene.plant.dt for period in {*PERIODS, scene.period}}
     fitting = [period for period, r in ratios.items() if r > 0.5 and abs(r - round(r)) <= 1e-9 * r]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import deque
 from concurrent.futures import BrokenExecutor, Executor, Future
@@ -27,6 +28,8 @@ _WAIT_FOR_SQLITE = 60.0  # s, while another process writes
 _AHEAD = 8
 # The best few in the search are run once more on other episodes: the best of many is partly lucky.
 _CONFIRMED = 3
+# Scores that differ by less are the same; then the shorter horizon is the better one: it takes less time.
+_SAME = 0.01
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,8 @@ def _prepare(search: Search, executor: Executor, progress: bool) -> Study:
     """Open or begin the study; its first trial is the start, which scores 1 by definition."""
     optuna = _optuna()
     start, name = search.start, search.scene.name
-    settings = {**described(search.scene, start, search.spread), "episodes": search.episodes, "seed": search.seed}
+    settings = {**described(search.scene, start, search.spread), "episodes": search.episodes, "seed": search.seed,
+                "keep_period": search.keep_period}  # fmt: skip
     study: Study = optuna.create_study(storage=_storage(search.storage), study_name=name, load_if_exists=True)
     theirs = study.user_attrs.get("settings")
     if theirs is None:
@@ -184,10 +188,12 @@ def _ask(study: Study, search: Search) -> Trial:
 
 def _confirm(search: Search, executor: Executor, progress: bool) -> Chosen | None:
     """Run the best of the search on other episodes; the first that still beats the start there is chosen."""
-    best = sorted((row for row in finished_trials(search) if row["score"] < 1.0), key=lambda row: float(row["score"]))
-    best = best[:_CONFIRMED]
-    if not best:
+    better = [row for row in finished_trials(search) if row["score"] < 1.0]
+    if not better:
         return None
+    least = min(row["score"] for row in better)
+    best = sorted(better, key=lambda row: (int(math.log(row["score"] / least) / _SAME), row["horizon"], row["score"]))
+    best = best[:_CONFIRMED]
     tunings = [candidate(search, row) for row in best]
     again = partial(measure, search.scene, search.start, seeds=search.other_seeds, spread=search.spread)
     pairs = finished(
