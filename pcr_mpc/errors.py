@@ -99,8 +99,8 @@ def checked_vector(name: str, value: Any, size: int) -> np.ndarray:
 def checked_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return ``value`` as a finite float64 array of the given shape; errors as `checked_vector`."""
     array = _float_array(name, value, shape)
-    # The sum is finite only if all entries are; a sum that overflows is looked at again.
-    if not math.isfinite(array.sum()) and not np.isfinite(array).all():
+    # The sum of squares is finite only if all entries are, and BLAS warns of nothing; if it overflows, look again.
+    if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():
         raise ValueError(f"{name} is not finite")
     return array
 

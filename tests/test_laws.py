@@ -123,10 +123,12 @@ def test_models_along_the_plan_are_those_of_fresh_linearisations(pair, centre):
     along.reset(x, centre)
     force, path = np.zeros(2), x + np.outer(np.arange(1, 5), [2e-3, 1e-3, 0, 0, 5e-3, -5e-3])
     for step in range(6):
-        found = along.models(path, np.zeros(2), force)
-        for at, model in zip(path, found, strict=True):
+        payloads = np.where(step + np.arange(4) >= 5, 0.1, 0.0)  # picked up on the way
+        found = along.models(path, np.zeros(2), force, payloads)
+        for at, model, payload in zip(path, found, payloads, strict=True):
             plant = Plant(pair)
             plant.reset(at, centre)
+            plant.carry(payload, at)
             fresh = linearise(plant, at, np.zeros(2), DT, force)
             near = at + rng.normal(0, 1e-3, 6) * [1, 1, 10, 10, 1, 1]
             u = rng.normal(0, 1, 2)
