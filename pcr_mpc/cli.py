@@ -14,21 +14,12 @@ from typing import Any
 from .cli_statics import export, solve_pose
 from .control.tuning import load_tuning
 from .errors import PCRError, SimulationError
-from .loop.choice import choose
-from .loop.chosen_rung import write_rung
-from .loop.episodes import Spread, lighter
 from .loop.model_inertia import by_model_inertia
-from .loop.parallel import local_workers
-from .loop.provenance import commit
 from .loop.run import Run
 from .loop.scene import load_scene
 from .loop.simulate import simulate
 from .loop.simulated_plant import SimulatedPlant
-from .loop.timing import time_scene
 from .loop.tracking import make_controller
-from .loop.tuning_file import default_path, to_tune, write_tuning
-from .loop.tuning_space import Search
-from .loop.tuning_study import finished_trials, tune
 from .plant.mujoco_plant import MuJoCoPlant
 from .plant.statics import METHODS
 from .report.choice_tables import choice_record, choice_table
@@ -41,6 +32,15 @@ from .report.tables import (
 )
 from .report.timing import plot_timing, timing_tables
 from .report.trade_off import plot_trade_off
+from .study.choice import choose
+from .study.chosen_rung import write_rung
+from .study.episodes import Spread, lighter
+from .study.parallel import local_workers
+from .study.provenance import commit
+from .study.timing import time_scene
+from .study.tuning_file import default_path, to_tune, write_tuning
+from .study.tuning_space import Search
+from .study.tuning_study import finished_trials, tune
 
 _EXAMPLES = """\
 examples:

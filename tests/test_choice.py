@@ -9,11 +9,11 @@ import pytest
 
 from pcr_mpc import ConvergenceError, load_scene
 from pcr_mpc.errors import NoRungError
-from pcr_mpc.loop.choice import Bench, Measured, apart, choose, lowest
-from pcr_mpc.loop.estimates import Estimates
-from pcr_mpc.loop.rungs import all_physics, discretisations, ladders, levels, named
 from pcr_mpc.loop.settings import Need, PlantSettings
 from pcr_mpc.report.choice_tables import choice_record, choice_table
+from pcr_mpc.study.choice import Bench, Measured, apart, choose, lowest
+from pcr_mpc.study.estimates import Estimates
+from pcr_mpc.study.rungs import all_physics, discretisations, ladders, levels, named
 
 from .conftest import MODELS
 

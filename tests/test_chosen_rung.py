@@ -9,10 +9,10 @@ import pytest
 
 from pcr_mpc import ModelError, load_scene
 from pcr_mpc.cli import main
-from pcr_mpc.loop.choice import choose
-from pcr_mpc.loop.chosen_rung import write_rung
 from pcr_mpc.loop.finding import digest, verified
-from pcr_mpc.loop.rungs import ladders, levels
+from pcr_mpc.study.choice import choose
+from pcr_mpc.study.chosen_rung import write_rung
+from pcr_mpc.study.rungs import ladders, levels
 
 from .conftest import CONTROLLERS, MODELS
 

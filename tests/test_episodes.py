@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from pcr_mpc import load_scene, make_controller, simulate
-from pcr_mpc.loop import episodes
 from pcr_mpc.loop.controllers import HoldMotors
-from pcr_mpc.loop.episodes import ALLOWED_ERROR, EXACT, Spread, run_episode, simulate_episode
 from pcr_mpc.loop.feed_forward import feed_forward
 from pcr_mpc.loop.trajectory import Hold
+from pcr_mpc.study import episodes
+from pcr_mpc.study.episodes import ALLOWED_ERROR, EXACT, Spread, run_episode, simulate_episode
 
 from .conftest import MODELS
 

@@ -8,7 +8,7 @@ import pytest
 
 from experiments import monte_carlo
 from experiments.monte_carlo import correlations, main, sizes, summarise, worst
-from pcr_mpc.loop.episodes import EXACT, Spread
+from pcr_mpc.study.episodes import EXACT, Spread
 
 from .test_parallel import Here
 

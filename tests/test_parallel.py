@@ -15,9 +15,9 @@ import pytest
 
 from pcr_mpc import load_scene
 from pcr_mpc.errors import StudyError
-from pcr_mpc.loop.episodes import EXACT, Spread, run_episode
-from pcr_mpc.loop.parallel import collect, finished, local_workers
-from pcr_mpc.loop.provenance import commit, described, differences, source_digest
+from pcr_mpc.study.episodes import EXACT, Spread, run_episode
+from pcr_mpc.study.parallel import collect, finished, local_workers
+from pcr_mpc.study.provenance import commit, described, differences, source_digest
 
 from .conftest import MODELS, ROOT
 
@@ -156,7 +156,7 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_workers(how, tmp_p
     path = tmp_path / "rows.jsonl"
     script = f"""
 import pathlib, signal
-from pcr_mpc.loop.parallel import collect, local_workers
+from pcr_mpc.study.parallel import collect, local_workers
 from tests.test_parallel import SETTINGS, slow
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from pcr_mpc.loop.stopwatch import WARM_UP, Times, measure
+from pcr_mpc.study.stopwatch import WARM_UP, Times, measure
 
 
 def test_record_keeps_the_first_calls_apart():

@@ -16,11 +16,11 @@ import pytest
 from pcr_mpc import PCRError, load_scene, load_tuning
 from pcr_mpc.cli import main
 from pcr_mpc.errors import StudyError
-from pcr_mpc.loop import tuning_score, tuning_space, tuning_study
-from pcr_mpc.loop.episodes import EXACT, Spread
-from pcr_mpc.loop.tuning_file import default_path, write_tuning
-from pcr_mpc.loop.tuning_score import Costs, measure, score
 from pcr_mpc.report.trade_off import pareto
+from pcr_mpc.study import tuning_score, tuning_space, tuning_study
+from pcr_mpc.study.episodes import EXACT, Spread
+from pcr_mpc.study.tuning_file import default_path, write_tuning
+from pcr_mpc.study.tuning_score import Costs, measure, score
 
 from .conftest import CONTROLLERS, MODELS
 from .test_parallel import Here

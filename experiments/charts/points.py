@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from pcr_mpc.loop.machine import machine
-from pcr_mpc.loop.provenance import commit
+from pcr_mpc.study.machine import machine
+from pcr_mpc.study.provenance import commit
 
 Row = dict[str, Any]
 Key = tuple[str, str, str]

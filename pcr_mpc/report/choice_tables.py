@@ -6,11 +6,11 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from ..loop.choice import Choice, Measured, apart
-from ..loop.estimates import Estimate
-from ..loop.rungs import ladders, levels, named
 from ..loop.scene import Scene
 from ..loop.settings import PlantSettings
+from ..study.choice import Choice, Measured, apart
+from ..study.estimates import Estimate
+from ..study.rungs import ladders, levels, named
 from .tables import table
 
 

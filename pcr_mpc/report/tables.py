@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ..loop.tuning_space import Search
-from ..loop.tuning_study import Chosen
 from ..plant.equilibrium import Equilibrium
 from ..plant.stability import assess_stability
+from ..study.tuning_space import Search
+from ..study.tuning_study import Chosen
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

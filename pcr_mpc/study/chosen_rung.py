@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import ModelError
+from ..loop.finding import digest
+from ..loop.scene import load_scene
+from ..loop.settings import PlantSettings
 from .choice import Choice
-from .finding import digest
 from .rungs import ladders, named
-from .scene import load_scene
-from .settings import PlantSettings
 
 _DIGITS = 3  # of figures in a scene file
 

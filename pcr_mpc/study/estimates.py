@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import PCRError
+from ..loop.scene import Scene
+from ..loop.settings import PlantSettings
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import inverse_statics
 from ..plant.robot import Rod
 from ..plant.statics import solve_statics
 from .rungs import levels
-from .scene import Scene
-from .settings import PlantSettings
 
 _POSES = 9  # along the motion
 _SUDDEN = 2.0  # swing of a spring from a force that appears at once, over its displacement at rest

@@ -10,14 +10,14 @@ import numpy as np
 from tqdm import tqdm
 
 from ..errors import NoRungError, PCRError, SimulationError
-from .controllers import Replay
+from ..loop.controllers import Replay
+from ..loop.run import Run
+from ..loop.scene import Scene
+from ..loop.settings import Need, PlantSettings
+from ..loop.simulate import simulate
+from ..loop.tracking import make_controller
 from .estimates import Estimate, Estimates
-from .run import Run
 from .rungs import all_physics, discretisations, height, named
-from .scene import Scene
-from .settings import Need, PlantSettings
-from .simulate import simulate
-from .tracking import make_controller
 
 # The yardstick's step: omega dt at most this for the fastest swing of the tip, within these parts of a period.
 _SMALL_STEP, _PARTS = 0.2, (10, 20, 40)

@@ -14,11 +14,11 @@ import numpy as np
 
 from ..control.tuning import Tuning
 from ..errors import SimulationError, checked_number
-from .feed_forward import InverseDynamics, feed_forward
-from .run import Run
-from .scene import Scene
-from .simulate import simulate
-from .tracking import make_controller
+from ..loop.feed_forward import InverseDynamics, feed_forward
+from ..loop.run import Run
+from ..loop.scene import Scene
+from ..loop.simulate import simulate
+from ..loop.tracking import make_controller
 
 Row = dict[str, Any]
 # An episode fails if the tip is further than this from its reference [m]: a third of the lemniscate's height, and

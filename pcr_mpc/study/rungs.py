@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import product
 
+from ..loop.scene import Scene
+from ..loop.settings import PAYLOADS, RODS, PlantSettings
 from ..plant.inertia import INERTIAS
 from ..plant.weight import WEIGHTS
-from .scene import Scene
-from .settings import PAYLOADS, RODS, PlantSettings
 
 # Steps in a control period: some, for what happens within it, such as a late decision. Force evaluations a step, which
 # is what a step costs.

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from ..loop.feed_forward import feed_forward
+from ..loop.run import Run
+from ..loop.scene import Scene
+from ..loop.simulate import simulate
+from ..loop.tracking import TrackingController, make_controller
 from ..plant.dynamics import DERIVATIVE_ACCURACY, Plant
 from ..plant.statics import METHODS
-from .feed_forward import feed_forward
 from .machine import machine, versions
 from .overhead import call_overhead
-from .run import Run
-from .scene import Scene
-from .simulate import simulate
 from .stopwatch import WARM_UP, Times, distribution, measure
-from .tracking import TrackingController, make_controller
 
 PLANT_HZ = (1000.0,)
 CONTROL_HZ = (100.0, 200.0, 500.0)

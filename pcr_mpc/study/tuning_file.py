@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, StudyError
-from .scene import Scene, load_scene
+from ..loop.scene import Scene, load_scene
 
 
 def default_path(scene_file: Path, name: str) -> Path:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..control.tuning import LINEARISE, Tuning
 from ..errors import PCRError
+from ..loop.scene import Scene
 from .episodes import Spread
-from .scene import Scene
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ..control.tuning import Tuning
+from ..loop.scene import Scene
 from .episodes import Spread
-from .scene import Scene
 
 _PACKAGE = Path(__file__).parent.parent
 
