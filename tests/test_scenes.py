@@ -79,8 +79,8 @@ def files(tmp_path):
         ("models/scenes/lemniscate.toml", 'kind = "lemniscate"', 'kind = "circle"', "kind", "one of"),
         ("models/scenes/lemniscate.toml", "tip = [0.0, 0.25]", "tip = [0.0, 0.2]", "start.tip", "not where"),
         ("models/scenes/lemniscate.toml", "duration = 6.0 ", "duration = 6.0\nspeed = 1", "speed", "unknown key"),
-        ("controllers/lemniscate.toml", "horizon = 10", "horizon = 0", "horizon", "integer >= 1"),
-        ("controllers/lemniscate.toml", "input = 0.03", "inputs = 0.03", "inputs", "did you mean 'input'"),
+        ("controllers/lemniscate.toml", "horizon = 6", "horizon = 0", "horizon", "integer >= 1"),
+        ("controllers/lemniscate.toml", "input = 0.1", "inputs = 0.1", "inputs", "did you mean 'input'"),
     ],
 )
 def test_a_wrong_file_is_named_with_its_key(files, file, old, new, key, message):
