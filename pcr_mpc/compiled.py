@@ -14,7 +14,7 @@ import casadi as ca
 from .errors import CompilerError
 
 # Without -ffast-math the results are those of the interpreter, bit for bit.
-_FLAGS = ("-O2", "-fPIC", "-shared")
+_FLAGS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
 
 
 def compiled(function: Any) -> Any:

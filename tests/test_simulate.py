@@ -15,6 +15,7 @@ from pcr_mpc import (
     make_controller,
     simulate,
 )
+from pcr_mpc.loop.controllers import Replay
 from pcr_mpc.loop.trajectory import Hold
 
 from .conftest import CONTROLLERS, MODELS
@@ -235,3 +236,33 @@ def test_plant_step_must_divide_the_period(lemniscate):
     plant = replace(lemniscate, plant=replace(lemniscate.plant, dt=3e-3)).make_plant()
     with pytest.raises(ValueError, match="does not divide"):
         simulate(lemniscate, plant, HoldMotors(2))
+
+
+def test_a_late_decision_is_late_when_it_arrives():
+    """With a delay of two periods, the second decision late by 4 ms: what was due meanwhile is in time."""
+    scene = replace(load_scene(MODELS / "scenes" / "hold_with_load.toml"), duration=0.06, delay=2, deadline=1e-3)
+    scene = replace(scene, plant=replace(scene.plant, dt=1e-3))
+    run = simulate(
+        scene,
+        scene.make_plant(),
+        Replay(0.1 * np.arange(1, 7)[:, None] * np.ones(2)),
+        spent=lambda k, _: 4e-3 if k == 1 else 0.0,
+    )
+    rates = np.diff(run.x[:, 4]) / run.dt
+    wanted = np.repeat([0.0, 0.0, 0.1, 0.2, 0.3, 0.4], 10)
+    wanted[30:34] = 0.1
+    assert rates == pytest.approx(wanted, abs=1e-9)
+
+
+def test_limits_on_angles_count_where_a_command_arrives():
+    """Two commands of 2 mrad each: by themselves within the stop at 2.5 mrad, but the second arrives after the first."""
+    scene = replace(load_scene(MODELS / "scenes" / "hold_with_load.toml"), duration=0.05, delay=2)
+    rods = [replace(rod, angle_limits=(float(q) - 1.0, float(q) + 2.5e-3))
+            for rod, q in zip(scene.robot.rods, scene.start().q, strict=True)]  # fmt: skip
+    robot = replace(scene.robot, rods=tuple(rods))
+    run = simulate(
+        replace(scene, robot=robot),
+        Plant(robot, dt=1e-3),
+        Replay(np.array([[0.2, 0.2], [0.2, 0.2], *np.zeros((3, 2))])),
+    )
+    assert run.limit_violations() == 1

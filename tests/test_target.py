@@ -31,7 +31,7 @@ def test_shift_carries_the_force(lemniscate, reference, k):
     target = MotorTarget(robot)
     target.start(inverse_statics(robot, state[:2], reference.forces[k], mode="LR"))
     wanted = inverse_statics(robot, state[:2], reference.forces[k] + force, mode="LR").q - state[4:]
-    small = target.small_shift(reference.angles_per_force[k], force)
+    small = target.small_shift(state[:2], state[4:], reference.angles_per_force[k], force)
     assert np.abs(wanted).max() > 2e-5
     assert small == pytest.approx(wanted, abs=np.abs(wanted).max() ** 2)
     for _ in range(3):
@@ -40,9 +40,9 @@ def test_shift_carries_the_force(lemniscate, reference, k):
 
 
 def test_large_shift_is_not_taken_to_first_order(lemniscate, reference):
-    target = MotorTarget(lemniscate.robot)
-    assert target.small_shift(reference.angles_per_force[0], np.array([0.4, 0.0])) is None
-    assert target.small_shift(reference.angles_per_force[0], np.array([np.nan, 0.0])) is None
+    target, x = MotorTarget(lemniscate.robot), reference.states[0]
+    for force in ([0.4, 0.0], [np.nan, 0.0]):
+        assert target.small_shift(x[:2], x[4:], reference.angles_per_force[0], np.array(force)) is None
 
 
 def test_statics_are_solved_for_the_target_only_where_the_shift_is_large(lemniscate, monkeypatch):
@@ -71,3 +71,14 @@ def test_inverse_dynamics_that_do_not_settle_are_refused(lemniscate, monkeypatch
     with pytest.raises(ConvergenceError, match=r"did not settle.*slower reference") as caught:
         feed_forward(lemniscate, lemniscate.robot, lemniscate.start(), 10, "condensed")
     assert 1e-5 < caught.value.residual < 1e-1
+
+
+def test_rods_are_brought_along_while_the_shift_is_small(lemniscate, reference):
+    """Else a force that comes late would have to be carried from the start pose, far away, in one step."""
+    target = MotorTarget(lemniscate.robot)
+    target.start(lemniscate.start())
+    before = target._plant.rungs["warm"]
+    for k in range(50):
+        x = reference.states[k]
+        target.small_shift(x[:2], x[4:], reference.angles_per_force[k], np.zeros(2))
+    assert target._plant.rungs["warm"] - before == 5

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import PCRError
 from ..frozen import freeze
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
@@ -104,8 +105,8 @@ class Run:
         """Control periods in which a command broke the limit on rate, on its change, or on the angle."""
         robot, period = self.scene.robot, self.scene.period
         change = np.diff(self.u, axis=0, prepend=np.zeros((1, robot.n_rods)))
-        # Where the command leads, not where the motor's stop lets it get.
-        starts = self.x[:: self.steps_per_period, 4:][: len(self.u)]
+        # Where the command leads from when it arrives, not where the motor's stop lets it get.
+        starts = self.x[self.scene.delay * self.steps_per_period :: self.steps_per_period, 4:][: len(self.u)]
         angles = starts + period * self.u[: len(starts)]
         lower, upper = robot.angle_limits.T
         broken = np.abs(self.u).max(axis=1, initial=0.0) > robot.rate_limit + _LIMIT_SLACK
@@ -118,12 +119,18 @@ class Run:
     def peak_torque(self) -> float:
         """Largest torque that a motor had to supply, by the exact rods at the control periods [N m].
 
-        The MPC keeps the robot's torque limit where it can; this is what to hold against it.
+        The MPC keeps the robot's torque limit where it can; this is what to hold against it. Up to where the rods were
+        lost, if they were: by a run that failed there, or by a snap.
         """
         plant = Plant(self.scene.robot, dt=self.dt)
         plant.reset(self.x[0], self.pose)
-        states = self.x[:: self.steps_per_period]
-        return float(max(np.abs(plant.equilibrium(x).motor_torque).max() for x in states))
+        largest = 0.0
+        for x in self.x[:: self.steps_per_period]:
+            try:
+                largest = max(largest, float(np.abs(plant.equilibrium(x).motor_torque).max()))
+            except PCRError:
+                break
+        return largest
 
     def _need(self) -> dict[str, Any] | None:
         """What the scene asks of the simulation, and what is known of that."""

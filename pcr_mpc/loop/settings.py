@@ -59,12 +59,15 @@ class PlantSettings:
             weight=self.weight,
         )
 
-    def describes(self, plant: object) -> bool:
-        """Whether a plant is simulated like this."""
+    def describes(self, plant: object, robot: Robot) -> bool:
+        """Whether a plant of a robot is simulated like this."""
         if not isinstance(plant, Plant):
             return False
         own = self.method, self.integrator, self.dt, self.inertia
-        return own == (plant.method, plant.integrator, plant.dt, plant.inertia)
+        if own != (plant.method, plant.integrator, plant.dt, plant.inertia):
+            return False
+        alike = self.make(robot)
+        return (alike.weight, alike.robot, alike.shooting) == (plant.weight, plant.robot, plant.shooting)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,9 @@ def simulate(
     plant.reset(x, pose)
     controller.start(pose)
     noise = np.random.default_rng(seed)
-    on_the_way = deque([np.zeros(scene.robot.n_rods)] * scene.delay)
+    # Rates, how many steps late they come, and what the plan foresaw for the period after.
+    still = np.zeros(scene.robot.n_rods)
+    on_the_way = deque([(still, 0, still)] * scene.delay)
     n_periods, n = scene.n_periods, scene.robot.n_rods
 
     states = np.empty((n_periods * per + 1, len(x)))
@@ -101,7 +103,7 @@ def simulate(
             slack=slack,
             rungs=plant.rungs,
             events=events,
-            rung=scene.plant if scene.plant.describes(plant) else None,
+            rung=scene.plant if scene.plant.describes(plant, scene.robot) else None,
         )
 
     try:
@@ -117,12 +119,10 @@ def simulate(
             control_time[k, 5] = time.thread_time() - began_cpu
             inputs[k] = decision.u
             decided = k + 1
-            on_the_way.append(decision.u)
-            arrived = on_the_way.popleft()
             cost = float(control_time[k, 0]) if spent is None else spent(k, float(control_time[k, 0]))
-            waiting = 0
+            late = 0
             if cost > scene.deadline:
-                waiting = min(per, math.ceil(cost / plant.dt))
+                late = min(per, math.ceil(cost / plant.dt))
                 events.append(
                     {"t": k * scene.period, "kind": "late", "message": f"{1e3 * cost:.3g} ms, {scene.late} until then"}
                 )
@@ -141,6 +141,10 @@ def simulate(
                             "message": f"{plan.fallback}: {plan.status}",
                         }
                     )
+            foreseen = scene.late == "shifted_plan" and decision.plan is not None and len(decision.plan.inputs) > 1
+            after = decision.plan.inputs[1] if foreseen and decision.plan is not None else decision.u
+            on_the_way.append((decision.u, late, after))
+            arrived, waiting, after = on_the_way.popleft()
             for j in range(per):
                 u = meanwhile if j < waiting else arrived
                 if done in changes:
@@ -160,8 +164,7 @@ def simulate(
                         }
                     )
                 snapped = len(plant.snaps)
-            foreseen = scene.late == "shifted_plan" and decision.plan is not None and len(decision.plan.inputs) > 1
-            meanwhile = decision.plan.inputs[1] if foreseen and decision.plan is not None else arrived
+            meanwhile = after
     except (Exception, KeyboardInterrupt) as error:  # whatever it is, the run so far is kept
         what = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
         t = done * plant.dt

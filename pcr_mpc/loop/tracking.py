@@ -142,10 +142,12 @@ class TrackingController:
         self._u, self._plan = plan.inputs[0], plan
         self._on_the_way.append(self._u)
         arriving = self._on_the_way.popleft()
-        if models is not None:
+        if now is not None:
+            self._predicts = now
+        elif models is not None:
             # A plan may know better than the models that it was asked for with.
             better = models if plan.models is None or plan.fallback else plan.models
-            self._predicts = now or (better if isinstance(better, LinearModel) else better[0])
+            self._predicts = better if isinstance(better, LinearModel) else better[0]
         if observer is not None:
             observer.predict(self._predicts, arriving)
         return Decision(plan.inputs[0], plan, linearised)
@@ -177,7 +179,7 @@ class TrackingController:
         if self.observer is not None:
             end, lever = states[-1], self._reference.angles_per_force[k + horizon]
             forces = forces + force
-            shift = self._target.small_shift(lever, force)
+            shift = self._target.small_shift(end[:2], end[4:], lever, force)
             states = states.copy()
             states[:, 4:] += self._target.shift(end[:2], end[4:], forces[-1]) if shift is None else shift
         return Reference(states, inputs, forces)

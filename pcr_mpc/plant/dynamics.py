@@ -108,7 +108,8 @@ class Plant:
         self._modal = ModalStep(rods, int(modes)) if inertia == "full" else None
         self._advance = self._modal or INTEGRATORS[integrator](robot.n_rods)
         self._mass_moves = inertia in ("condensed", "full")
-        self._solver = make_solver(rods, method, checked_shooting(segments, steps, scheme), snapping=on_snap == "jump")
+        self.shooting = checked_shooting(segments, steps, scheme)
+        self._solver = make_solver(rods, method, self.shooting, snapping=on_snap == "jump")
         self._sag = CondensedWeight(robot) if weight == "condensed" else None
         self._at: list[float] | None = None
         self._accuracy = 0.0  # of the derivatives there

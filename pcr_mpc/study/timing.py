@@ -182,7 +182,8 @@ def _control_times(
     """Times of n control steps on the states of the run, what they consist of, and QP iterations; without warm-up."""
     assert scene.tuning is not None
     tail = scene.tuning.horizon + scene.delay
-    reference = feed_forward(scene, scene.robot, run.pose, tail, scene.tuning.model.inertia)
+    known = scene if scene.tuning.model.payload else replace(scene, payload=None)
+    reference = feed_forward(known, scene.robot, run.pose, tail, scene.tuning.model.inertia)
     controller = make_controller(scene, reference=reference)
     assert isinstance(controller, TrackingController)
     states, lap = run.x[:: run.steps_per_period], len(run.u)
