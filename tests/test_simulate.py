@@ -255,7 +255,7 @@ def test_a_late_decision_is_late_when_it_arrives():
 
 
 def test_limits_on_angles_count_where_a_command_arrives():
-    """Two commands of 2 mrad each: by themselves within the stop at 2.5 mrad, but the second arrives after the first."""
+    """Two commands of 2 mrad each: by itself each is within the stop at 2.5 mrad, but the second comes on top."""
     scene = replace(load_scene(MODELS / "scenes" / "hold_with_load.toml"), duration=0.05, delay=2)
     rods = [replace(rod, angle_limits=(float(q) - 1.0, float(q) + 2.5e-3))
             for rod, q in zip(scene.robot.rods, scene.start().q, strict=True)]  # fmt: skip
