@@ -42,6 +42,8 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	cp results/fold_guard/*.png results/controllers/*.png docs/
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
 	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
+	$(BIN)/pcr-mpc timing models/scenes/lemniscate.toml --out results/timing
+	cp results/timing/timing.png docs/
 
 charts: $(READY)  ## speed against accuracy: three charts, their CSVs and the ratios, in docs/; wants an idle machine
 	$(BIN)/python -m experiments.accuracy_vs_speed --out results/charts
