@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import binomtest, spearmanr
 
 from pcr_mpc import PCRError, Scene, SimulationError, Tuning, load_scene, load_tuning
@@ -183,6 +184,10 @@ def plot(rows: list[Row], title: str, path: Path) -> None:
     low, high = right.get_ylim()
     right.set_ylim(low, high * (high / low) ** 0.25)  # room for the legend
     right.legend(loc="upper left", fontsize=8)
+    for axis in (left.xaxis, right.yaxis):  # within a decade, as across several
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     figure.savefig(path)
     plt.close(figure)
 
