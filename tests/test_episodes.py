@@ -135,7 +135,8 @@ def test_the_reference_is_solved_once_and_is_the_same(scene, monkeypatch):
 
 def test_a_reference_that_is_too_short_is_refused(scene):
     short = feed_forward(scene, scene.robot, scene.start(), scene.tuning.horizon - 1)
-    with pytest.raises(ValueError, match="reference has 39 periods; scene and horizon need 40"):
+    needed = scene.n_periods + scene.tuning.horizon
+    with pytest.raises(ValueError, match=f"reference has {needed - 1} periods; scene and horizon need {needed}"):
         make_controller(scene, reference=short)
 
 
