@@ -243,7 +243,9 @@ def test_settings_name_what_differs(scene):
         "scene.robot.tip_mass was 0.25, is 0.3"
     ]
     tuning = replace(scene.tuning, horizon=12)
-    assert differences(old, described(scene, tuning, Spread())) == ["scene.tuning.horizon was 10, is 12"]
+    assert differences(old, described(scene, tuning, Spread())) == [
+        f"scene.tuning.horizon was {scene.tuning.horizon}, is 12"
+    ]
     changed = differences(old, described(scene, scene.tuning, EXACT))
     assert "spread.force was 1.0, is 0.0" in changed
     assert all(line.startswith("spread.") for line in changed)
