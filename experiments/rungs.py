@@ -78,7 +78,7 @@ def plot(choices: list[Choice], path: Path) -> None:
         axes.axhline(allowed, color=GREY, ls="--", lw=1.2)
         style = {"ha": "right", "va": "top", "fontsize": 8.5, "color": "#444444"}
         axes.annotate(f"need {allowed:g} mm", (0.98, allowed), xycoords=("axes fraction", "data"), **style)
-        axes.set(xscale="log", yscale="log", title=choice.scene.name, xlim=(15, 6e4), ylim=(FLOOR / 2, 2e2))
+        axes.set(xscale="log", yscale="log", title=choice.scene.name, xlim=(8, 6e4), ylim=(FLOOR / 2, 2e2))
         axes.tick_params(labelbottom=True)
     for axes in panels[:, 0]:
         axes.set_ylabel("largest tip error [mm]")
