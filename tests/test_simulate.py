@@ -266,3 +266,22 @@ def test_limits_on_angles_count_where_a_command_arrives():
         Replay(np.array([[0.2, 0.2], [0.2, 0.2], *np.zeros((3, 2))])),
     )
     assert run.limit_violations() == 1
+
+
+def test_torque_is_known_up_to_where_the_rods_were_lost(run):
+    x = run.x.copy()
+    x[100:, :2] = 9.0  # m, out of reach
+    lost = replace(run, x=x)
+    assert lost.peak_torque == pytest.approx(replace(run, x=run.x[:100]).peak_torque, rel=1e-12)
+    assert 0.0 < lost.peak_torque <= run.peak_torque
+
+
+@pytest.mark.parametrize(
+    "other", [{"segments": 1}, {"weight": "none"}, {"robot": "heavier"}], ids=["segments", "weight", "robot"]
+)
+def test_a_plant_is_the_scenes_only_with_all_its_settings(other):
+    scene = load_scene(SCENES / "vertical.toml")
+    robot = scene.robot if "robot" not in other else replace(scene.robot, tip_mass=0.3)
+    settings = {name: value for name, value in other.items() if name != "robot"}
+    assert scene.plant.describes(scene.make_plant(), scene.robot)
+    assert not scene.plant.describes(replace(scene.plant, **settings).make(robot), scene.robot)

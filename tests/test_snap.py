@@ -124,3 +124,14 @@ def test_single_shooting_does_not_notice_snaps(pair):
         Plant(pair, method="single_shooting", on_snap="jump")
     with pytest.raises(ValueError, match="on_snap"):
         Plant(pair, on_snap="fly")
+
+
+def test_a_snap_that_is_undone_is_not_kept(pair, centre):
+    plant = Plant(pair, on_snap="jump")
+    wind_up(plant, centre, 20, turn=0.3 * WINDING)
+    assert plant.snaps == []
+    solver = plant._solver
+    solver.move(centre.p, centre.q + [WINDING, 0.0])
+    assert len(solver.snaps) == 1
+    solver.go_back()
+    assert solver.snaps == []

@@ -80,6 +80,7 @@ class RodSolver:
         self.snapping = snapping
         self.rungs: Counter[str] = Counter()
         self.snaps: list[Snap] = []
+        self._snaps_before = 0  # the last move
         # Plain rods share one follower.
         count = 1 if method.physics is None else robot.n_rods
         self._followers = [RodFollower(method, method.physics_of(i)) for i in range(count)] * (robot.n_rods // count)
@@ -129,6 +130,7 @@ class RodSolver:
             Neither Newton's method nor continuation got there.
         """
         state = self.state
+        self._snaps_before = len(self.snaps)
         if self._move_warm(state, p, q, derivatives):
             self.rungs["warm"] += 1
             return
@@ -200,6 +202,7 @@ class RodSolver:
 
     def go_back(self) -> None:
         """Undo the last `move`."""
+        del self.snaps[self._snaps_before :]
         self._state, self._spare = self._spare, self._state
 
     def force(self) -> np.ndarray:
