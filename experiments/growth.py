@@ -102,7 +102,7 @@ def segments(pair: Robot, n: int) -> dict[str, float]:
     plant.reset(x, pose)
     assert plant.step_model is not None
     graph = BufferedFunction(step_function(plant.step_model, 1, details=True, compiled=False))
-    for place, value in zip(graph.inputs, (plant.memory(x), x, np.zeros(4)), strict=True):
+    for place, value in zip(graph.inputs, (plant.memory(x), x, np.zeros(4), plant.numbers), strict=True):
         place[:] = value
     spent = []
     for _ in range(400):

@@ -66,7 +66,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
             f"and (c dt/m)^2 is {damping * damping:.3g}, at most {_STIFFEST:g}; shorten the period or keep away from "
             "taut rods"
         )
-    function = _discretisation(plant.robot.n_rods, threading.get_ident())
+    function = _buffered(plant.robot.n_rods, threading.get_ident())
     function.inputs[0][:] = k
     function.inputs[1][:] = g
     function.inputs[2][:] = force - f_ext - plant.tip_weight
@@ -84,7 +84,12 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
 
 
 @lru_cache(maxsize=32)
-def _discretisation(n: int, thread: int) -> BufferedFunction:
+def _buffered(n: int, thread: int) -> BufferedFunction:
+    return BufferedFunction(discretisation(n))
+
+
+@lru_cache(maxsize=16)
+def discretisation(n: int) -> Any:
     """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q)) -> [A, c, B, E],
     column by column in one vector."""
     k, g, force = ca.SX.sym("K", 2, 2), ca.SX.sym("G", 2, n), ca.SX.sym("F", 2)
@@ -138,4 +143,4 @@ def _discretisation(n: int, thread: int) -> BufferedFunction:
     e_matrix = ca.vertcat(ca.diag(units) @ phi_1 @ scale, ca.SX(n, 2))
     results = [ca.vertcat(ca.vec(a_matrix), c_vector, ca.vec(b_matrix), ca.vec(e_matrix))]
     arguments = [k, g, force, x, parameters, mass, slopes]
-    return BufferedFunction(ca.Function("discretise", arguments, results, {"cse": True}))
+    return ca.Function("discretise", arguments, results, {"cse": True})

@@ -13,6 +13,7 @@ from .equilibrium import Equilibrium
 from .integrators import INTEGRATORS
 from .mass_matrix import CondensedMass, MassMatrix, tip_mass
 from .modal_step import ModalStep
+from .numbers import Kind
 from .plant_choices import ON_SNAP, checked_choices
 from .quick_step import QuickStep
 from .robot import Robot
@@ -97,6 +98,11 @@ class Plant:
         compiled: bool = False,
     ) -> None:
         method, weight, rods = checked_choices(robot, method, inertia, modes, weight, integrator, dt, on_snap)
+        self._settings: dict[str, Any] = {
+            "method": method, "segments": segments, "steps": steps, "scheme": scheme, "inertia": inertia,
+            "modes": modes, "weight": weight, "integrator": integrator, "dt": dt, "on_snap": on_snap,
+            "compiled": compiled,
+        }  # fmt: skip
         self.robot = robot
         self.method = method
         self.inertia = inertia
@@ -121,12 +127,18 @@ class Plant:
         self.step_model: StepModel | None = None
         if isinstance(self._solver, RodSolver):
             of_rods = self._solver.method
+            kind = Kind(robot.n_rods, of_rods.layout)
+            self.numbers = kind.pack(robot)
             if inertia != "none":
-                self._condensed = CondensedMass(robot, of_rods)
+                self._condensed = CondensedMass(rods, of_rods)
             if inertia != "full":
-                self.step_model = StepModel(robot, rods, of_rods, integrator, inertia, weight == "condensed", dt)
+                self.step_model = StepModel(kind, of_rods, integrator, inertia, weight, dt)
         self._quick: QuickStep | None = None
         self._quick_at: list[float] | None = None
+
+    def of(self, robot: Robot) -> Plant:
+        """Return a plant that simulates another robot in the same way; errors as `Plant`."""
+        return Plant(robot, **self._settings)
 
     def reset(self, x: Any, guess: Equilibrium | None = None) -> None:
         """Put the rods on the branch of ``guess`` at state x, or on the branch of least energy (None)."""
@@ -187,11 +199,12 @@ class Plant:
         self.payload, self._mass_at = payload, None
         self._tip_weight = self.robot.tip_weight + payload * np.array(self.robot.gravity)
         if self.step_model is not None:
+            kind = self.step_model.kind
+            self.numbers = kind.pack(replace(self.robot, tip_mass=self.robot.tip_mass + payload))
             if self._quick is not None:
                 self._quick.hand_over()
-                self._quick = self._quick_at = None  # its graph has the mass of the tip
-            loaded = replace(self.robot, tip_mass=self.robot.tip_mass + payload)
-            self.step_model = replace(self.step_model, robot=loaded)
+                self._quick_at = None  # the memory has the mass matrix
+                self._quick.of(self.numbers)
         if self._modal is not None:
             self._modal.rods.tip_mass = self.robot.tip_mass + payload
 
@@ -266,7 +279,7 @@ class Plant:
             if self.step_model is None:
                 return None
             assert isinstance(self._solver, RodSolver)
-            self._quick = QuickStep(self.step_model, self._solver, compiled=self.compiled)
+            self._quick = QuickStep(self.step_model, self._solver, self.numbers, compiled=self.compiled)
         at = x.tolist()
         del at[2:4]
         if self._at is not self._quick_at or at != self._at:

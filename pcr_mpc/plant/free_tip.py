@@ -14,6 +14,7 @@ from .chart import held_shapes
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod_method import Shooting, closed_form_method, shooting_method
+from .rod_physics import robot_layout
 from .rod_solver import RodSolver
 
 _MAX_ITERATIONS = 100
@@ -376,7 +377,7 @@ def free_solver(robot: Robot) -> RodSolver:
     """Build a solver by the method that is exact for the robot's rods."""
     if robot.needs_shooting is None:
         return RodSolver(robot, closed_form_method())
-    return RodSolver(robot, shooting_method(_SHOOTING, robot))
+    return RodSolver(robot, shooting_method(_SHOOTING, robot_layout(robot)))
 
 
 @lru_cache(maxsize=32)

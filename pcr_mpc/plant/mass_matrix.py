@@ -12,6 +12,7 @@ import numpy as np
 from ..buffered import BufferedFunction
 from ..errors import ConvergenceError
 from ..frozen import read_only
+from .numbers import Kind
 from .robot import Robot
 from .rod_method import RodMethod, inlined
 
@@ -35,7 +36,9 @@ class CondensedMass:
     """
 
     def __init__(self, robot: Robot, method: RodMethod) -> None:
-        self._graph = BufferedFunction(robot_mass(robot, method))
+        kind = Kind(robot.n_rods, method.layout)
+        self._graph = BufferedFunction(robot_mass(kind, method))
+        self._graph.inputs[2][:] = kind.pack(robot)
 
     def __call__(self, unknowns: np.ndarray, q: np.ndarray, payload: float = 0.0) -> MassMatrix:
         """M and its slopes for w = [v, q'], in equilibrium, with what the tip carries [kg].
@@ -63,28 +66,27 @@ class CondensedMass:
 
 
 @lru_cache(maxsize=16)
-def robot_mass(robot: Robot, method: RodMethod) -> Any:
+def robot_mass(kind: Kind, method: RodMethod) -> Any:
     """Graph of the mass matrix.
 
     Returns
     -------
     casadi.Function
-        (unknowns (u, n), q (n)) -> M (2 + n, 2 + n) in [kg, kg m, kg m^2] for w = [v, q'], and d vec(M) / d(p, q),
-        shape ((2 + n)^2, 2 + n).
+        (unknowns (u, n), q (n), numbers) -> M (2 + n, 2 + n) in [kg, kg m, kg m^2] for w = [v, q'], and
+        d vec(M) / d(p, q), shape ((2 + n)^2, 2 + n).
     """
-    n, of_rod = robot.n_rods, method.mass()
+    n, of_rod, vector = kind.n_rods, method.mass(), ca.MX.sym("numbers", kind.size)
+    numbers = kind.unpack(vector)
     unknowns, q = ca.MX.sym("unknowns", of_rod.size1_in(0), n), ca.MX.sym("q", n)
     mass, slopes = ca.MX(2 + n, 2 + n), ca.MX((2 + n) ** 2, 2 + n)
-    mass[0, 0] = mass[1, 1] = robot.tip_mass
-    for i, rod in enumerate(robot.rods):
-        physics = method.physics_of(i)
-        known = [] if physics is None else [ca.DM(physics.values)]
-        rod_matrix, rod_slopes = of_rod(unknowns[:, i], q[i], *known)
-        units = ca.DM([1.0, 1.0, rod.length])
+    mass[0, 0] = mass[1, 1] = numbers.tip_mass
+    for i, rod in enumerate(numbers.rods):
+        rod_matrix, rod_slopes = of_rod(unknowns[:, i], q[i], *rod.physics)
+        units = ca.vertcat(1, 1, rod.length)
         scale = rod.line_density * rod.length * units @ units.T
-        rod_slopes = ca.diag(ca.vec(scale)) @ rod_slopes @ ca.diag(ca.DM([1 / rod.length, 1 / rod.length, 1.0]))
+        rod_slopes = ca.diag(ca.vec(scale)) @ rod_slopes @ ca.diag(ca.vertcat(1 / rod.length, 1 / rod.length, 1))
         own = [0, 1, 2 + i]
         places = [row + (2 + n) * column for column in own for row in own]
         mass[own, own] += scale * rod_matrix
         slopes[places, own] += rod_slopes
-    return inlined(ca.Function("robot_mass", [unknowns, q], [ca.densify(mass), ca.densify(slopes)]), of_rod)
+    return inlined(ca.Function("robot_mass", [unknowns, q, vector], [ca.densify(mass), ca.densify(slopes)]), of_rod)

@@ -22,15 +22,17 @@ class QuickStep:
     model : StepModel
     solver : RodSolver
         Of the same rods.
+    numbers : ndarray
+        Of the robot, as ``model.kind`` packs them.
     compiled : bool
         Whether the step is machine code.
     """
 
-    def __init__(self, model: StepModel, solver: RodSolver, *, compiled: bool) -> None:
+    def __init__(self, model: StepModel, solver: RodSolver, numbers: np.ndarray, *, compiled: bool) -> None:
         self._model, self._solver, self._compiled = model, solver, compiled
         self._limits = limits(model)
         self._solves = _SOLVES[model.integrator]
-        self._n = model.robot.n_rods
+        self._n, self._numbers = model.kind.n_rods, numbers
         # Two for each number of corrections, so that a step that fails leaves the last pose whole.
         self._graphs = {CORRECTIONS[0]: self._pair(CORRECTIONS[0])}
         self._last = self._graphs[CORRECTIONS[0]][0]
@@ -38,7 +40,17 @@ class QuickStep:
 
     def _pair(self, corrections: int) -> tuple[BufferedFunction, BufferedFunction]:
         function = step_function(self._model, corrections, details=True, compiled=self._compiled)
-        return BufferedFunction(function), BufferedFunction(function)
+        pair = BufferedFunction(function), BufferedFunction(function)
+        for graph in pair:
+            graph.inputs[3][:] = self._numbers
+        return pair
+
+    def of(self, numbers: np.ndarray) -> None:
+        """Go on with the numbers of another robot of this kind."""
+        self._numbers = numbers
+        for pair in self._graphs.values():
+            for graph in pair:
+                graph.inputs[3][:] = numbers
 
     def load(self, memory: np.ndarray) -> None:
         """Start from the solver's pose, whose memory this is."""
@@ -56,7 +68,7 @@ class QuickStep:
                 self._graphs[corrections] = self._pair(corrections)
             one, other = self._graphs[corrections]
             graph = other if one is self._last else one
-            memory, start, given = graph.inputs
+            memory, start, given, _ = graph.inputs
             memory[:], start[:], given[:n], given[n:] = self._last.outputs[0], x, u, f_ext
             graph()
             verdict = graph.outputs[2].tolist()

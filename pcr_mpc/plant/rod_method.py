@@ -12,9 +12,8 @@ import numpy as np
 
 from . import elastica, inertia, multiple_shooting, shooting_inertia
 from .chart import HeldShape
-from .robot import Robot
-from .rod import RodPhysics, aligned_steps, sample_rod
-from .rod_physics import robot_physics
+from .numbers import Kind
+from .rod import Layout, RodPhysics, aligned_steps, sample_rod
 
 # Graphs up to this size are inlined into the graph of the whole robot; larger ones are called by it.
 _INLINED_INSTRUCTIONS = 4000
@@ -66,8 +65,8 @@ class RodMethod:
         (unknowns, clamp angle, wanted number N) -> nodes (4, N); the shooting methods keep their own number.
     mass : callable
         () -> casadi.Function, the condensed inertia of a rod (see `inertia.rod_mass`); built when it is wanted.
-    physics : tuple of RodPhysics or None
-        Of each rod: the third argument of its graphs. None: plain rods, whose graphs have none.
+    layout : Layout or None
+        Of what its graphs take as a third argument. None: they are of plain rods, and take none.
     """
 
     name: str
@@ -82,18 +81,13 @@ class RodMethod:
     from_nodes: Callable[[np.ndarray, RodPhysics | None], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
     mass: Callable[[], Any]
-    physics: tuple[RodPhysics, ...] | None = None
-
-    def physics_of(self, rod: int) -> RodPhysics | None:
-        """Physics of one rod."""
-        return None if self.physics is None else self.physics[rod]
+    layout: Layout | None = None
 
 
 @lru_cache
-def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
-    """Multiple shooting, paper sec. 4, for any rods; the unknowns are the nodes."""
-    n, physics = shooting.segments, robot_physics(robot)
-    layout = None if physics is None else physics[0].layout
+def shooting_method(shooting: Shooting, layout: Layout | None) -> RodMethod:
+    """Multiple shooting, paper sec. 4, for rods of any layout; the unknowns are the nodes."""
+    n = shooting.segments
     steps = aligned_steps(layout, n, shooting.steps)
     newton, residual = multiple_shooting.rod_newton(n, steps, shooting.scheme, layout)
     start, change = ca.SX.sym("start", 4 * n), ca.SX.sym("change", 4 * n)
@@ -116,7 +110,7 @@ def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
         from_nodes=from_nodes,
         to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
         mass=lambda: shooting_inertia.rod_mass(n, steps, shooting.scheme, layout),
-        physics=physics,
+        layout=layout,
     )
 
 
@@ -141,7 +135,7 @@ def closed_form_method() -> RodMethod:
 
 
 @lru_cache(maxsize=16)
-def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
+def warm_step(kind: Kind, method: RodMethod, iterations: int) -> Any:
     """Tangent predictor, a fixed number of Newton iterations and the verdict, for the whole robot in one graph.
 
     Nothing is decided in here: the caller reads the verdict, and keeps the result or takes the slow way. After a
@@ -151,14 +145,15 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     Returns
     -------
     casadi.Function
-        ([p, q] (2 + n), start) -> record, verdict, result, each a vector in one piece, for copying many small arrays
-        costs as much as the arithmetic. The record of a pose holds, column by column, unknowns (u, n), tangents
-        (u, 3n), poses (3, n), loads (3, n), load_tangents (3, 3n), scalars (5, n), of which the first three are the
-        start of the next (see `RobotState`). Verdict (5) = [largest residual, largest residual where the derivatives
-        were taken, largest change of an unknown of the branch beyond the prediction, number of conjugate points, drift
-        of the invariant]; result (6 + 2n) = force (2) [N], K (2, 2) [N/m], G (2, n) [N/rad].
+        ([p, q] (2 + n), start, numbers) -> record, verdict, result, each a vector in one piece, for copying many
+        small arrays costs as much as the arithmetic. The record of a pose holds, column by column, unknowns (u, n),
+        tangents (u, 3n), poses (3, n), loads (3, n), load_tangents (3, 3n), scalars (5, n), of which the first three
+        are the start of the next (see `RobotState`). Verdict (5) = [largest residual, largest residual where the
+        derivatives were taken, largest change of an unknown of the branch beyond the prediction, number of conjugate
+        points, drift of the invariant]; result (6 + 2n) = force (2) [N], K (2, 2) [N/m], G (2, n) [N/rad].
     """
-    n, width = robot.n_rods, method.newton.size1_in(0)
+    n, width = kind.n_rods, method.newton.size1_in(0)
+    vector = ca.MX.sym("numbers", kind.size)
     target, start_record = ca.MX.sym("target", 2 + n), ca.MX.sym("start", (4 * width + 3) * n)
     p, q = target[:2], target[2:]
     blocks = ca.vertsplit(start_record, [0, width * n, 4 * width * n, (4 * width + 3) * n])
@@ -169,10 +164,9 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     columns: dict[str, list[Any]] = {name: [] for name in ("u", "t", "pose", "loads", "load_t", "scalars")}
     residuals, roughest, changes = [], [], []
     force, k, g = ca.MX(2, 1), ca.MX(2, 2), []
-    for i, rod in enumerate(robot.rods):
-        of_rod = method.physics_of(i)
-        known = [] if of_rod is None else [ca.DM(of_rod.values)]
-        pose = ca.vertcat((p - ca.DM(rod.base)) / rod.length, q[i])
+    for i, rod in enumerate(kind.unpack(vector).rods):
+        known = rod.physics
+        pose = ca.vertcat((p - rod.base) / rod.length, q[i])
         start = tangents[:, 3 * i : 3 * i + 3]
         u = predicted = method.retract(unknowns[:, i], start @ (pose - poses[:, i]))
         for _ in range(iterations):
@@ -196,7 +190,7 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     verdict = ca.vertcat(sum(residuals), sum(roughest), sum(changes), conjugate_points, drift)
     record = ca.vertcat(*(ca.vec(ca.horzcat(*found)) for found in columns.values()))
     result = ca.vertcat(force, ca.vec(k), ca.vec(ca.horzcat(*g)))
-    function = ca.Function("warm_step", [target, start_record], [record, verdict, result])
+    function = ca.Function("warm_step", [target, start_record, vector], [record, verdict, result])
     return inlined(function, method.newton)
 
 

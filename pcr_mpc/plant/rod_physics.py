@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,8 @@ _MOST_INTERVALS = 128
 
 
 @lru_cache(maxsize=64)
-def robot_physics(robot: Robot) -> tuple[RodPhysics, ...] | None:
-    """Physics of each rod, all of one layout; None if all rods are plain and the closed form holds.
+def robot_layout(robot: Robot) -> Layout | None:
+    """Return the layout that all rods of a robot share; None if all are plain and the closed form holds.
 
     Raises
     ------
@@ -36,11 +37,22 @@ def robot_physics(robot: Robot) -> tuple[RodPhysics, ...] | None:
             f"grid of at most {_MOST_INTERVALS} intervals; give lists of equal length",
             key="curvature",
         )
-    layout = Layout(
+    return Layout(
         intervals=0 if constant else intervals,
         varying=any(set(rod.stiffness_factors) != {1.0} for rod in robot.rods),
         stretching=any(rod.stretches for rod in robot.rods),
     )
+
+
+@lru_cache(maxsize=64)
+def robot_physics(robot: Robot) -> tuple[RodPhysics, ...] | None:
+    """Physics of each rod, all of one layout; None if all rods are plain. Errors as `robot_layout`."""
+    layout = robot_layout(robot)
+    return None if layout is None else in_layout(robot, layout)
+
+
+def in_layout(robot: Robot, layout: Layout) -> tuple[RodPhysics, ...]:
+    """Physics of each rod in a layout that has room for it."""
     return tuple(_of_rod(rod, robot.gravity, layout) for rod in robot.rods)
 
 
@@ -62,15 +74,22 @@ def plain_physics(layout: Layout) -> np.ndarray:
     return values
 
 
-def _of_rod(rod: Rod, gravity: tuple[float, float], layout: Layout) -> RodPhysics:
-    length, ei = rod.length, rod.bending_stiffness
-    weight = rod.line_density * length**3 / ei * np.array(gravity)
-    curvature = length * _at_knots(rod.curvatures, layout.intervals)
-    stiffness = _at_knots(rod.stiffness_factors, layout.intervals) if layout.varying else np.empty(0)
-    compliance = ei / (length**2 * rod.axial_stiffness)
-    return RodPhysics(layout, read_only(np.concatenate([weight, [compliance], curvature, stiffness])))
+def normalised(
+    stiffness: Any, length: Any, density: Any, gravity: Any, axial_compliance: Any, curvature: Any, factors: Any
+) -> tuple[Any, ...]:
+    """Values of `RodPhysics` in the order of its layout, from numbers in SI units or from expressions."""
+    weight = density * length**3 / stiffness * gravity
+    return weight, stiffness / length**2 * axial_compliance, length * curvature, factors
 
 
-def _at_knots(values: tuple[float, ...], intervals: int) -> np.ndarray:
+def at_knots(values: tuple[float, ...], intervals: int) -> np.ndarray:
+    """A property at equally spaced knots along the rod, shape (intervals + 1,)."""
     given = np.linspace(0.0, 1.0, len(values)) if len(values) > 1 else np.zeros(1)
     return np.interp(np.linspace(0.0, 1.0, intervals + 1), given, values)
+
+
+def _of_rod(rod: Rod, gravity: tuple[float, float], layout: Layout) -> RodPhysics:
+    factors = at_knots(rod.stiffness_factors, layout.intervals) if layout.varying else np.empty(0)
+    curvature = at_knots(rod.curvatures, layout.intervals)
+    own = rod.bending_stiffness, rod.length, rod.line_density, np.array(gravity), 1.0 / rod.axial_stiffness
+    return RodPhysics(layout, read_only(np.hstack(normalised(*own, curvature, factors))))

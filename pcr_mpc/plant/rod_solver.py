@@ -11,10 +11,11 @@ import numpy as np
 from ..buffered import BufferedFunction
 from ..errors import ConvergenceError, PCRError, UnstableError
 from .equilibrium import Equilibrium
+from .numbers import Kind
 from .robot import Robot
 from .rod_follower import BRANCH_CHANGE, BranchEnds, NotConverged, RodFollower
 from .rod_method import RodMethod, warm_step
-from .rod_physics import require_plain
+from .rod_physics import in_layout, require_plain
 from .rod_state import RobotState, RodState
 
 # Residual beyond which another iteration is not worth trying.
@@ -71,7 +72,7 @@ class RodSolver:
     """
 
     def __init__(self, robot: Robot, method: RodMethod, *, snapping: bool = False) -> None:
-        if method.physics is None:
+        if method.layout is None:
             require_plain(robot, f"method {method.name!r}")
         elif snapping:
             require_plain(robot, "on_snap='jump'")
@@ -82,9 +83,12 @@ class RodSolver:
         self.snaps: list[Snap] = []
         self._snaps_before = 0  # the last move
         # Plain rods share one follower.
-        count = 1 if method.physics is None else robot.n_rods
-        self._followers = [RodFollower(method, method.physics_of(i)) for i in range(count)] * (robot.n_rods // count)
-        self._warm = [BufferedFunction(warm_step(robot, method, iterations)) for iterations in (1, 2)]
+        physics = (None,) if method.layout is None else in_layout(robot, method.layout)
+        self._followers = [RodFollower(method, of_rod) for of_rod in physics] * (robot.n_rods // len(physics))
+        kind = Kind(robot.n_rods, method.layout)
+        self._warm = [BufferedFunction(warm_step(kind, method, iterations)) for iterations in (1, 2)]
+        for warm in self._warm:
+            warm.inputs[2][:] = kind.pack(robot)
         self._state: RobotState | None = None
         self._spare: RobotState | None = None
         self._force_units = robot.stiffnesses / robot.lengths**2
@@ -152,7 +156,7 @@ class RodSolver:
         solved = self.method.tolerance if derivatives is None else self.method.following
         source, changed, iterations = state.start, 0.0, 0
         for warm in (self._warm[0 if rough else 1], self._warm[0]):
-            target, start = warm.inputs
+            target, start, _ = warm.inputs
             target[:2], target[2:], start[:] = p, q, source
             warm()
             residual, at_derivatives, change, conjugate_points, drift = warm.outputs[1].tolist()

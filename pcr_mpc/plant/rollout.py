@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from ..buffered import BufferedFunction
@@ -14,6 +16,7 @@ from ..errors import PCRError, checked_array
 from ..frozen import freeze
 from .dynamics import Plant
 from .equilibrium import Equilibrium
+from .robot import Robot
 from .step_graph import CORRECTIONS, StepModel, limits, step_function
 
 # Steps in one call: more of them make nothing faster.
@@ -55,6 +58,7 @@ def rollout(
     f_ext: Any = (0.0, 0.0),
     *,
     guess: Equilibrium | None = None,
+    robots: Sequence[Robot] | None = None,
     threads: int = 1,
 ) -> Rollout:
     """Move robots through sequences of inputs that are known in advance, up to a thousand steps in one call.
@@ -74,6 +78,9 @@ def rollout(
         External force on the tips besides their weight [N].
     guess : Equilibrium, optional
         On whose branch the rods start; None: on that of least energy.
+    robots : sequence of R Robot, optional
+        Robots that differ from the plant's, and from each other, in their numbers only (see `Kind`). None: all are the
+        plant's.
     threads : int
         Of the machine to work in; robots are shared out among them.
 
@@ -89,33 +96,39 @@ def rollout(
         raise ValueError(f"method {plant.method!r} with inertia {plant.inertia!r} has no rollout; use Plant.step")
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
         raise ValueError(f"threads is {threads!r}, expected a whole number of at least 1")
-    starts, inputs, f_ext, many = _checked(plant, x0, inputs, f_ext)
-    robots, steps = inputs.shape[:2]
-    x, residual = np.empty((robots, steps + 1, plant.n_states)), np.empty((robots, steps))
-    memories = _memories(plant, starts, guess)
-    model = plant.step_model  # after the resets, which take a payload away
+    starts, inputs, f_ext, many = _checked(plant, x0, inputs, f_ext, robots)
+    count, steps = inputs.shape[:2]
+    plants = [plant] * count if robots is None else [plant.of(robot) for robot in robots]
+    x, residual = np.empty((count, steps + 1, plant.n_states)), np.empty((count, steps))
+    memories = _memories(plants, starts, guess)
+    numbers = np.stack([one.numbers for one in plants])  # after the resets, which take a payload away
     at_once = max(1, _MOST_STEPS // min(steps, _STEPS))
-    done = np.zeros(robots, dtype=bool)
+    done = np.zeros(count, dtype=bool)
     for corrections in CORRECTIONS:
         left = np.flatnonzero(~done)
         for first in range(0, len(left), at_once):
             some = left[first : first + at_once]
             given = np.concatenate([inputs[some], f_ext[some]], axis=2)
             settings = corrections, plant.compiled, threads
-            x[some], residual[some], done[some] = _moved(model, settings, memories[some], starts[some], given)
+            x[some], residual[some], done[some] = _moved(
+                plant.step_model, settings, memories[some], starts[some], given, numbers[some]
+            )
     stepped = np.flatnonzero(~done).tolist()
     for i in stepped:
-        x[i], residual[i] = _stepped(plant, i, starts[i], inputs[i], f_ext[i], guess)
+        x[i], residual[i] = _stepped(plants[i], i, starts[i], inputs[i], f_ext[i], guess)
     t = plant.dt * np.arange(steps + 1)
     return Rollout(t, x if many else x[0], residual if many else residual[0], tuple(stepped))
 
 
-def _checked(plant: Plant, x0: Any, inputs: Any, f_ext: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+def _checked(
+    plant: Plant, x0: Any, inputs: Any, f_ext: Any, different: Sequence[Robot] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
     """Arguments with all their axes, and whether there is one of robots."""
     x0, inputs, f_ext = np.asarray(x0), np.asarray(inputs), np.asarray(f_ext)
-    n, many = plant.robot.n_rods, x0.ndim == 2 or inputs.ndim == 3 or f_ext.ndim == 3
+    n, many = plant.robot.n_rods, x0.ndim == 2 or inputs.ndim == 3 or f_ext.ndim == 3 or different is not None
     steps = inputs.shape[-2] if inputs.ndim in (2, 3) else 1
     robots = next((a.shape[0] for a, ndim in ((x0, 2), (inputs, 3), (f_ext, 3)) if a.ndim == ndim), 1)
+    robots = robots if different is None else len(different)
     if not steps or not robots:
         raise ValueError(f"inputs has shape {inputs.shape}, expected at least one step and one robot")
     x0 = checked_array("x0", x0, (*((robots,) if x0.ndim == 2 else ()), plant.n_states))
@@ -130,14 +143,14 @@ def _checked(plant: Plant, x0: Any, inputs: Any, f_ext: Any) -> tuple[np.ndarray
     )
 
 
-def _memories(plant: Plant, starts: np.ndarray, guess: Equilibrium | None) -> np.ndarray:
-    """What the graphs start from; robots that start alike share it."""
-    found: dict[bytes, np.ndarray] = {}
-    for x in starts:
-        if x.tobytes() not in found:
+def _memories(plants: list[Plant], starts: np.ndarray, guess: Equilibrium | None) -> np.ndarray:
+    """What the graphs start from; robots that are and start alike share it."""
+    found: dict[tuple[Plant, bytes], np.ndarray] = {}
+    for plant, x in zip(plants, starts, strict=True):
+        if (plant, x.tobytes()) not in found:
             plant.reset(x, guess)
-            found[x.tobytes()] = plant.memory(x)
-    return np.stack([found[x.tobytes()] for x in starts])
+            found[plant, x.tobytes()] = plant.memory(x)
+    return np.stack([found[plant, x.tobytes()] for plant, x in zip(plants, starts, strict=True)])
 
 
 def _moved(
@@ -146,6 +159,7 @@ def _moved(
     memories: np.ndarray,
     starts: np.ndarray,
     given: np.ndarray,
+    numbers: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States, residuals, and which robots kept to their branch all the way."""
     robots, steps = given.shape[:2]
@@ -156,9 +170,10 @@ def _moved(
         length = block.stop - first
         graph = _many_steps(model, length, robots, *settings, threading.get_ident())
         # CasADi puts robots and steps side by side, column by column: rows of these views.
-        memory, start, told = (place.T.reshape(robots, -1) for place in graph.inputs)
+        memory, start, told, of_robots = (place.T.reshape(robots, -1) for place in graph.inputs)
         results = [place.T.reshape(robots, length, -1) for place in graph.outputs]
         memory[:], start[:], told[:] = memories, x[:, first], given[:, block].reshape(robots, -1)
+        of_robots[:] = numbers
         graph()
         memories = results[0][:, -1].copy()
         x[:, first + 1 : block.stop + 1], verdicts[:, block] = results[1:]
@@ -172,7 +187,10 @@ def _many_steps(
 ) -> BufferedFunction:
     """One graph for each thread of the caller's: its buffers are shared memory."""
     step = step_function(model, corrections, details=False, compiled=compiled)
-    graph = step.mapaccum("steps", steps, 2, {})
+    many = step.mapaccum("steps", steps, 2, {})
+    memory, x, given, numbers = (ca.MX.sym(step.name_in(i), *step.size_in(i)) for i in range(4))
+    told = ca.MX.sym("told", given.size1(), steps)
+    graph = ca.Function("steps", [memory, x, told, numbers], many(memory, x, told, ca.repmat(numbers, 1, steps)))
     if robots > 1:
         graph = graph.map(robots, "thread", threads) if threads > 1 else graph.map(robots, "serial")
     return BufferedFunction(graph)

@@ -13,7 +13,7 @@ from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod import SCHEMES
 from .rod_method import Shooting, closed_form_method, shooting_method
-from .rod_physics import require_plain
+from .rod_physics import require_plain, robot_layout
 from .rod_solver import RodSolver
 from .single_shooting import SingleShooting
 
@@ -164,7 +164,7 @@ def make_solver(robot: Robot, method: str, shooting: Shooting, *, snapping: bool
     if method == "closed_form":
         return RodSolver(robot, closed_form_method(), snapping=snapping)
     if method == "multiple_shooting":
-        return RodSolver(robot, shooting_method(shooting, robot), snapping=snapping)
+        return RodSolver(robot, shooting_method(shooting, robot_layout(robot)), snapping=snapping)
     if method == "single_shooting":
         if snapping:
             raise ValueError("single shooting does not notice where a branch ends: on_snap='jump' needs another method")

@@ -16,7 +16,7 @@ import numpy as np
 from ..compiled import compiled as machine_code
 from .integrators import RK4_STAGES, euler_graph, first_half_graph, second_half_graph, stage_graph, stop_graph
 from .mass_matrix import robot_mass
-from .robot import Robot
+from .numbers import Kind
 from .rod_follower import BRANCH_CHANGE
 from .rod_method import RodMethod, warm_step
 from .weight import robot_weight
@@ -35,31 +35,29 @@ class StepModel:
 
     Attributes
     ----------
-    robot : Robot
-    rods : Robot
-        The same with the gravity under which its rods bend.
+    kind : Kind
+        Of the robot; its numbers are an input.
     method : RodMethod
-        Of ``rods``.
+        Of its rods.
     integrator : {"semi_implicit_euler", "velocity_verlet", "rk4"}
     inertia : {"none", "constant", "condensed"}
-    weighed : bool
-        Whether the rods' weight is condensed.
+    weight : {"none", "condensed", "exact"}
+        Of the rods.
     dt : float
         [s].
     """
 
-    robot: Robot
-    rods: Robot
+    kind: Kind
     method: RodMethod
     integrator: str
     inertia: str
-    weighed: bool
+    weight: str
     dt: float
 
     @property
     def widths(self) -> tuple[int, int, int]:
         """Numbers of a memory: what starts the rods, F, and M with its derivatives as far as they are not fixed."""
-        n = self.robot.n_rods
+        n = self.kind.n_rods
         mass = {"none": 0, "constant": (2 + n) ** 2, "condensed": (2 + n) ** 2 * (3 + n)}[self.inertia]
         return (4 * self.method.newton.size1_in(0) + 3) * n, 2, mass
 
@@ -72,18 +70,19 @@ class StepModel:
 class _Motion:
     """Rods and mass on their way through a step, as expressions."""
 
-    def __init__(self, model: StepModel, memory: Any, rates: Any, push: Any, corrections: int) -> None:
-        self.model, self.n = model, model.robot.n_rods
-        self._push = push
+    def __init__(self, model: StepModel, vector: Any, memory: Any, rates: Any, f_ext: Any, corrections: int) -> None:
+        self.model, self.n = model, model.kind.n_rods
+        self._vector, self.numbers = vector, model.kind.unpack(vector)
+        self._of_rods = vector if model.weight == "exact" else model.kind.weightless(vector)
+        self._push = f_ext + self.numbers.tip_mass * self.numbers.gravity
         self._rates, self._corrections = rates, corrections
         start, force, mass = model.widths
         self.start, self.force, mass = ca.vertsplit(memory, [0, start, start + force, start + force + mass])
         size = 2 + self.n
         self._mass: tuple[Any, Any]
         if model.inertia == "none":
-            tip = np.zeros((size, size))
-            tip[0, 0] = tip[1, 1] = model.robot.tip_mass
-            self._mass = ca.DM(tip), ca.DM.zeros(size**2, size)
+            tip = self.numbers.tip_mass
+            self._mass = ca.diag(ca.vertcat(tip, tip, np.zeros(self.n))), ca.DM.zeros(size**2, size)
         elif model.inertia == "constant":
             self._mass = ca.reshape(mass, size, size), ca.DM.zeros(size**2, size)
         else:
@@ -94,21 +93,20 @@ class _Motion:
 
     def known(self) -> list[Any]:
         """First arguments of the graphs of `integrators`."""
-        robot = self.model.robot
-        return [*self._mass, self._push - self.force, self._rates, ca.DM([robot.drag, self.model.dt])]
+        return [*self._mass, self._push - self.force, self._rates, ca.vertcat(self.numbers.drag, self.model.dt)]
 
     def move(self, p: Any, q: Any) -> None:
         """Let the rods follow to (p, q)."""
         model = self.model
-        warm = warm_step(model.rods, model.method, self._corrections)
-        self.record, verdict, self.result = warm(ca.vertcat(p, q), self.start)
+        warm = warm_step(model.kind, model.method, self._corrections)
+        self.record, verdict, self.result = warm(ca.vertcat(p, q), self.start, self._of_rods)
         self.verdict += verdict
         self.start, self.force = self.record[: model.widths[0]], self.result[:2]
         unknowns = ca.reshape(self.record[: model.method.newton.size1_in(0) * self.n], -1, self.n)
-        if model.weighed:
-            self.force += robot_weight(model.robot)[0](unknowns, q)[1][:2]
+        if model.weight == "condensed":
+            self.force += robot_weight(model.kind)[0](unknowns, q, self._vector)[1][:2]
         if model.inertia == "condensed":
-            self._mass = tuple(robot_mass(model.robot, model.method)(unknowns, q))
+            self._mass = tuple(robot_mass(model.kind, model.method)(unknowns, q, self._of_rods))
 
     def memory(self) -> Any:
         """What the next step starts from."""
@@ -159,28 +157,29 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
     Returns
     -------
     casadi.Function
-        (memory, x (4 + n), [u, f_ext] (n + 2)) -> memory, x, verdict (5) and, with details, record and result at the
-        end of the step (see `warm_step`). A memory is of the pose of its x. u is what the motors are told, f_ext comes
-        on top of the tip's weight. The verdict is that of `warm_step`, added up over the solves of the step.
+        (memory, x (4 + n), [u, f_ext] (n + 2), numbers) -> memory, x, verdict (5) and, with details, record and result
+        at the end of the step (see `warm_step`). A memory is of the pose of its x. u is what the motors are told, f_ext
+        comes on top of the tip's weight. The verdict is that of `warm_step`, added up over the solves of the step.
     """
-    robot, n, dt = model.robot, model.robot.n_rods, model.dt
-    graphs = [warm_step(model.rods, model.method, corrections)]
+    n, dt = model.kind.n_rods, model.dt
+    graphs = [warm_step(model.kind, model.method, corrections)]
     if model.inertia == "condensed":
-        graphs.append(robot_mass(robot, model.method))
+        graphs.append(robot_mass(model.kind, model.method))
     symbol: Any = (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym
     memory, x, given = symbol("memory", sum(model.widths)), symbol("x", 4 + n), symbol("given", n + 2)
-    u, f_ext = given[:n], given[n:]
+    vector = symbol("numbers", model.kind.size)
+    u, f_ext, numbers = given[:n], given[n:], model.kind.unpack(vector)
     # As Robot.motor_rates.
-    lower, upper, limit, q = ca.DM(robot.angle_limits[:, 0]), ca.DM(robot.angle_limits[:, 1]), robot.rate_limit, x[4:]
+    lower, upper, limit, q = numbers.angle_lower, numbers.angle_upper, numbers.rate_limit, x[4:]
     rates = ca.fmin(ca.fmax(u, -limit), limit)
     rates = (ca.fmin(ca.fmax(q + dt * rates, lower), upper) - q) / dt
     rates = ca.fmin(ca.fmax(rates, -limit), limit)
-    motion = _Motion(model, memory, rates, f_ext + ca.DM(robot.tip_weight), corrections)
+    motion = _Motion(model, vector, memory, rates, f_ext, corrections)
     end = _INTEGRATORS[model.integrator](motion, x)
     results = [motion.memory(), end, motion.verdict]
     if details:
         results += [motion.record, motion.result]
-    return ca.Function("step", [memory, x, given], [ca.densify(r) for r in results])
+    return ca.Function("step", [memory, x, given, vector], [ca.densify(r) for r in results])
 
 
 @lru_cache(maxsize=32)

@@ -21,6 +21,7 @@ import numpy as np
 from ..buffered import BufferedFunction
 from .elastica import pendulum
 from .equilibrium import Equilibrium
+from .numbers import Kind
 from .robot import Robot
 
 WEIGHTS = ("none", "condensed", "exact")
@@ -36,8 +37,9 @@ class CondensedWeight:
     """
 
     def __init__(self, robot: Robot) -> None:
-        first, second = robot_weight(robot)
-        self._first, self._second = BufferedFunction(first), BufferedFunction(second)
+        kind = Kind(robot.n_rods)
+        self._first, self._second = (BufferedFunction(graph) for graph in robot_weight(kind))
+        self._first.inputs[2][:] = self._second.inputs[2][:] = kind.pack(robot)
 
     def first(self, unknowns: np.ndarray, q: np.ndarray) -> tuple[float, np.ndarray]:
         """U_g [J] and dU_g/d(p, q), shape (2 + n,) [N, N m]."""
@@ -113,15 +115,16 @@ def _rod_weight() -> tuple[Any, Any]:
 
 
 @lru_cache(maxsize=16)
-def robot_weight(robot: Robot) -> tuple[Any, Any]:
-    """Graphs of a robot: (unknowns (3, n), q (n)) -> U_g [J] and dU_g/d(p, q) (2 + n); and its second derivatives."""
-    n = robot.n_rods
-    unknowns, q = ca.SX.sym("unknowns", 3, n), ca.SX.sym("q", n)
+def robot_weight(kind: Kind) -> tuple[Any, Any]:
+    """Graphs of plain rods: (unknowns (3, n), q (n), numbers) -> U_g [J], dU_g/d(p, q) (2 + n); second derivatives."""
+    n = kind.n_rods
+    unknowns, q, vector = ca.SX.sym("unknowns", 3, n), ca.SX.sym("q", n), ca.SX.sym("numbers", kind.size)
+    numbers = kind.unpack(vector)
     energy, slope, curvature = ca.SX(1, 1), ca.SX(2 + n, 1), ca.SX(2 + n, 2 + n)
     first, second = _rod_weight()
-    for i, rod in enumerate(robot.rods):
-        known = unknowns[:, i], q[i], rod.line_density * rod.length * ca.DM(robot.gravity)
-        by_pose = ca.diag(ca.DM([1 / rod.length, 1 / rod.length, 1.0]))
+    for i, rod in enumerate(numbers.rods):
+        known = unknowns[:, i], q[i], rod.line_density * rod.length * numbers.gravity
+        by_pose = ca.diag(ca.vertcat(1 / rod.length, 1 / rod.length, 1))
         own = [0, 1, 2 + i]
         of_rod, slope_of_rod = first(*known)
         energy += rod.length * of_rod
@@ -129,6 +132,6 @@ def robot_weight(robot: Robot) -> tuple[Any, Any]:
         curvature[own, own] += rod.length * by_pose @ second(*known) @ by_pose
     options = {"cse": True}
     return (
-        ca.Function("weight", [unknowns, q], [energy, ca.densify(slope)], options),
-        ca.Function("weight_slope", [unknowns, q], [ca.densify(curvature)], options),
+        ca.Function("weight", [unknowns, q, vector], [energy, ca.densify(slope)], options),
+        ca.Function("weight_slope", [unknowns, q, vector], [ca.densify(curvature)], options),
     )

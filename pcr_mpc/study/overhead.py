@@ -41,7 +41,7 @@ def call_overhead(robot: Robot, pose: Equilibrium) -> list[dict[str, Any]]:
         plant.reset(x, pose)
         model = plant.step_model
         assert model is not None
-        arguments = plant.memory(x), x, np.zeros(robot.n_rods + 2)
+        arguments = plant.memory(x), x, np.zeros(robot.n_rods + 2), plant.numbers
         try:
             function = step_function(model, 1, details=True, compiled=compiled)
         except CompilerError:

@@ -1,0 +1,114 @@
+"""Linear models as a graph: what `linearise` does for a plant, with the rods' memory as an input and an output."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+
+from ..plant.mass_matrix import robot_mass
+from ..plant.rod_method import warm_step
+from ..plant.step_graph import StepModel
+from ..plant.weight import robot_weight
+from .linearise import discretisation
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Lengths of the vectors of a `model_graph`.
+
+    Attributes
+    ----------
+    memory : int
+        What the rods start from; the first part of a record.
+    record : int
+        All about the rods at the pose (see `warm_step`).
+    model : int
+        A, c, B and E, column by column.
+    """
+
+    memory: int
+    record: int
+    model: int
+
+
+def sizes(model: StepModel) -> Sizes:
+    """Lengths for a plant's ``step_model``."""
+    n, width = model.kind.n_rods, model.method.newton.size1_in(0)
+    n_states = 4 + n
+    return Sizes((4 * width + 3) * n, (4 * width + 20) * n, n_states * (n_states + 1 + n + 2))
+
+
+@lru_cache(maxsize=16)
+def force_graph(model: StepModel, iterations: int) -> Any:
+    """The rods' force and its derivatives with everything that weighs on it.
+
+    Returns
+    -------
+    casadi.Function
+        ([p, q] (2 + n), memory, numbers) -> record, verdict (5) (see `warm_step`), F (2) [N], K (2, 2) [N/m],
+        G (2, n) [N/rad].
+    """
+    kind, n = model.kind, model.kind.n_rods
+    symbol = _symbol(model, iterations)
+    target, memory = symbol("target", 2 + n), symbol("memory", sizes(model).memory)
+    vector = symbol("numbers", kind.size)
+    of_rods = vector if model.weight == "exact" else kind.weightless(vector)
+    record, verdict, result = warm_step(kind, model.method, iterations)(target, memory, of_rods)
+    force, k, g = result[:2], ca.reshape(result[2:6], 2, 2), ca.reshape(result[6:], 2, n)
+    if model.weight == "condensed":
+        unknowns = ca.reshape(record[: model.method.newton.size1_in(0) * n], -1, n)
+        first, second = robot_weight(kind)
+        force += first(unknowns, target[2:], vector)[1][:2]
+        curvature = second(unknowns, target[2:], vector)
+        k, g = k + curvature[:2, :2], g + curvature[:2, 2:]
+    return ca.Function("force", [target, memory, vector], [record, verdict, force, k, g])
+
+
+@lru_cache(maxsize=16)
+def model_graph(model: StepModel, iterations: int) -> Any:
+    """Linear model about a state, the rods following from a memory; nothing is decided in here.
+
+    Returns
+    -------
+    casadi.Function
+        (x (4 + n), f_ext (2) [N], payload [kg], memory, numbers, M (2 + n, 2 + n), dt) -> record, model (see `Sizes`),
+        verdict (7): that of `warm_step`, then K dt^2/m and (c dt/m)^2 (see `linearise`). M is the mass matrix where
+        the inertia is "constant", and not used otherwise.
+    """
+    kind, n = model.kind, model.kind.n_rods
+    symbol = _symbol(model, iterations)
+    x, f_ext, payload = symbol("x", 4 + n), symbol("f_ext", 2), symbol("payload")
+    memory, vector = symbol("memory", sizes(model).memory), symbol("numbers", kind.size)
+    constant, dt = symbol("mass", 2 + n, 2 + n), symbol("dt")
+    numbers = kind.unpack(vector)
+    record, verdict, force, k, g = force_graph(model, iterations)(ca.vertcat(x[:2], x[4:]), memory, vector)
+    tip = numbers.tip_mass + payload
+    slopes = ca.DM.zeros((2 + n) ** 2, 2 + n)
+    if model.inertia == "none":
+        mass = ca.diag(ca.vertcat(tip, tip, ca.DM.zeros(n)))
+    elif model.inertia == "constant":
+        mass = constant
+    else:
+        of_rods = vector if model.weight == "exact" else kind.weightless(vector)
+        unknowns = ca.reshape(record[: model.method.newton.size1_in(0) * n], -1, n)
+        mass, slopes = robot_mass(kind, model.method)(unknowns, x[4:], of_rods)
+    if model.inertia != "none":
+        mass = mass + ca.diag(ca.vertcat(payload, payload, ca.DM.zeros(n)))
+    push = force - f_ext - tip * numbers.gravity
+    packed = discretisation(n)(k, g, push, x, ca.vertcat(numbers.drag, dt), mass, slopes)
+    stiffness, damping = ca.norm_inf(ca.vec(k)) * dt**2 / numbers.tip_mass, numbers.drag * dt / numbers.tip_mass
+    return ca.Function(
+        "model", [x, f_ext, payload, memory, vector, constant, dt],
+        [record, packed, ca.vertcat(verdict, stiffness, damping**2)],
+    )  # fmt: skip
+
+
+def _symbol(model: StepModel, iterations: int) -> Any:
+    """SX where all the parts are, so that the whole is one list of instructions; else MX."""
+    graphs = [warm_step(model.kind, model.method, iterations)]
+    if model.inertia == "condensed":
+        graphs.append(robot_mass(model.kind, model.method))
+    return (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym
