@@ -1,0 +1,102 @@
+"""From linear models and a reference to the QP in the inputs alone, and from its solution to states and residuals.
+
+A model is one column [vec(A), c, vec(B), vec(E)] (see `LinearModel`). With S_k = dx_k/dU and the adjoint
+L_k = Q S_k + A_k' L_(k+1), L_N = T S_N, row block k of the Hessian is B_k' L_(k+1): as many small products as there are
+blocks, where the sum over all periods of every block would take a horizon times more.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+
+# Graphs up to this many periods become one list of instructions; longer ones stay matrices, which take no time to build.
+_UNROLLED = 12
+
+
+class _Models:
+    """Models of all periods, taken from their columns; the motors are exact integrators, which prunes the graph."""
+
+    def __init__(self, packed: Any, horizon: int, n: int, dt: Any) -> None:
+        n_states = 4 + n
+        single = packed.size2() == 1
+        ends = [0, n_states**2, n_states * (n_states + 1), n_states * (n_states + 1 + n)]
+        self.a, self.b, self.c = [], [], []
+        for k in range(1 if single else horizon):
+            a, c, b, _ = ca.vertsplit(packed[:, k], [*ends, packed.size1()])
+            a, b = ca.reshape(a, n_states, n_states)[:4, :], ca.reshape(b, n_states, n)[:4, :]
+            self.a.append(ca.vertcat(a, ca.horzcat(ca.DM(n, 4), ca.DM.eye(n))))
+            self.b.append(ca.vertcat(b, dt * ca.DM.eye(n)))
+            self.c.append(ca.vertcat(c[:4], ca.DM(n, 1)))
+        if single:
+            self.a, self.b, self.c = self.a * horizon, self.b * horizon, self.c * horizon
+
+
+@lru_cache(maxsize=32)
+def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool) -> Any:
+    """Graph of the QP data of `build_qp`.
+
+    Parameters
+    ----------
+    models : int
+        1, for the whole horizon, or the horizon.
+    velocity, angle : bool
+        Whether they have a weight.
+
+    Returns
+    -------
+    casadi.Function
+        (models (size, 1 or N), x (4 + n), states (4 + n, N), inputs (n, N), u_previous (n), weights (4), T, bounds (n, 4),
+        dt) -> P as `QuadraticProgram` holds it, q, l, u.
+    """
+    n_states = 4 + n
+    packed = ca.MX.sym("models", n_states * (n_states + 1 + n + 2), models)
+    x, states, inputs = ca.MX.sym("x", n_states), ca.MX.sym("states", n_states, horizon), ca.MX.sym("inputs", n, horizon)
+    previous, weights = ca.MX.sym("previous", n), ca.MX.sym("weights", 4)
+    terminal, bounds, dt = ca.MX.sym("terminal", n_states, n_states), ca.MX.sym("bounds", n, 4), ca.MX.sym("dt")
+    model = _Models(packed, horizon, n, dt)
+    # A weight of zero is left out of the graph, not multiplied.
+    used = [weights[0], weights[1] if velocity else ca.DM(1, 1), weights[2] if angle else ca.DM(1, 1)]
+    stage = ca.diag(ca.vertcat(used[0], used[0], used[1], used[1], *[used[2]] * n))
+
+    # Response to the inputs so far and, in the last column, the free response less the reference.
+    free, responses = x, [ca.DM(n_states, 0)]
+    misses = []
+    for k in range(horizon):
+        free = model.a[k] @ free + model.c[k]
+        misses.append(free - states[:, k])
+        responses.append(ca.horzcat(model.a[k] @ responses[k], model.b[k]))
+    rows, gradient = [], []
+    adjoint = terminal @ ca.horzcat(responses[horizon], misses[-1])
+    for k in range(horizon - 1, -1, -1):
+        block = model.b[k].T @ adjoint
+        rows.insert(0, block[:, :-1])
+        gradient.insert(0, block[:, -1] - weights[3] * inputs[:, k])
+        if k:
+            # Later inputs have no say in x_k: what is left is the Hessian's lower triangle.
+            earlier = ca.horzcat(adjoint[:, : n * k], adjoint[:, -1])
+            adjoint = stage @ ca.horzcat(responses[k], misses[k - 1]) + model.a[k].T @ earlier
+    triangle = []
+    for k, row in enumerate(rows):
+        for i in range(n):
+            j = n * k + i
+            triangle += [row[i, :j].T, row[i, j] + weights[3]]
+
+    rate, change, lower, upper = ca.horzsplit(bounds)
+    first = ca.vertcat(previous, ca.DM.zeros(n * (horizon - 1), 1))
+    l_all = [
+        -ca.repmat(rate, horizon, 1),
+        first - ca.repmat(change, horizon, 1),
+        ca.repmat((lower - x[4:]) / dt, horizon, 1),
+    ]
+    u_all = [
+        ca.repmat(rate, horizon, 1),
+        first + ca.repmat(change, horizon, 1),
+        ca.repmat((upper - x[4:]) / dt, horizon, 1),
+    ]
+    results = [ca.vertcat(*triangle), ca.vertcat(*gradient), ca.vertcat(*l_all), ca.vertcat(*u_all)]
+    arguments = [packed, x, states, inputs, previous, weights, terminal, bounds, dt]
+    graph = ca.Function("condense", arguments, [ca.densify(result) for result in results])
+    return graph.expand("condense", {"cse": True}) if horizon <= _UNROLLED else graph
