@@ -100,3 +100,38 @@ def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool
     arguments = [packed, x, states, inputs, previous, weights, terminal, bounds, dt]
     graph = ca.Function("condense", arguments, [ca.densify(result) for result in results])
     return graph.expand("condense", {"cse": True}) if horizon <= _UNROLLED else graph
+
+
+@lru_cache(maxsize=32)
+def checking(horizon: int, n: int, models: int) -> Any:
+    """Graph of what a solution of the QP leads to, and of how good it is.
+
+    Returns
+    -------
+    casadi.Function
+        (models (size, 1 or N), x (4 + n), inputs (n, N), multipliers of rates and changes (2 N n), P, q, l, u, bounds
+        (n, 4), dt) -> states (4 + n, N + 1), [largest violation of the rows of rates and changes, largest entry of
+        P U + q + A'y, largest excess of an angle over its limits [rad]].
+    """
+    n_states, size = 4 + n, horizon * n
+    packed = ca.MX.sym("models", n_states * (n_states + 1 + n + 2), models)
+    x, inputs, y = ca.MX.sym("x", n_states), ca.MX.sym("inputs", n, horizon), ca.MX.sym("y", 2 * size)
+    upper_triangle, q = ca.MX.sym("P", size * (size + 1) // 2), ca.MX.sym("q", size)
+    lower, upper = ca.MX.sym("l", 3 * size), ca.MX.sym("u", 3 * size)
+    bounds, dt = ca.MX.sym("bounds", n, 4), ca.MX.sym("dt")
+    model = _Models(packed, horizon, n, dt)
+    states = [x]
+    for k in range(horizon):
+        states.append(model.a[k] @ states[k] + model.b[k] @ inputs[:, k] + model.c[k])
+    angles = ca.horzcat(*states[1:])[4:, :]
+    excess = ca.fmax(ca.mmax(bounds[:, 2] - angles), ca.mmax(angles - bounds[:, 3]))
+    u = ca.vec(inputs)
+    rows = ca.vertcat(u, u - ca.vertcat(ca.DM.zeros(n), u[:-n]))
+    primal = ca.fmax(ca.mmax(ca.vertcat(lower[: 2 * size] - rows, rows - upper[: 2 * size])), 0)
+    of_rates, of_changes = y[:size], y[size:]
+    pull = of_rates + of_changes - ca.vertcat(of_changes[n:], ca.DM.zeros(n))
+    hessian = ca.MX(ca.Sparsity.upper(size), upper_triangle)
+    dual = ca.norm_inf(ca.triu2symm(hessian) @ u + q + pull)
+    arguments = [packed, x, inputs, y, upper_triangle, q, lower, upper, bounds, dt]
+    graph = ca.Function("check", arguments, [ca.horzcat(*states), ca.vertcat(primal, dual, excess)])
+    return graph.expand("check", {"cse": True}) if horizon <= _UNROLLED else graph

@@ -16,7 +16,7 @@ from .linear_model import LinearModel
 
 # Taylor order and squarings of the matrix exponential: better than 1e-9 up to K dt^2/m and (c dt/m)^2 of 1000.
 _TAYLOR_ORDER, _SQUARINGS = 8, 6
-_STIFFEST = 1e3
+STIFFEST = 1e3
 
 
 def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) -> LinearModel:
@@ -60,10 +60,10 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     inertia, slopes = plant.mass(x[:2], x[4:])
     mass, drag = plant.robot.tip_mass, plant.robot.drag
     stiffness, damping = max(map(abs, k.ravel().tolist())) * dt * dt / mass, drag * dt / mass
-    if not (stiffness <= _STIFFEST and damping * damping <= _STIFFEST):
+    if not (stiffness <= STIFFEST and damping * damping <= STIFFEST):
         raise ValueError(
             f"dt = {dt} s is too long for the stiffness at p = {x[:2]} m or for the drag: K dt^2/m is {stiffness:.3g} "
-            f"and (c dt/m)^2 is {damping * damping:.3g}, at most {_STIFFEST:g}; shorten the period or keep away from "
+            f"and (c dt/m)^2 is {damping * damping:.3g}, at most {STIFFEST:g}; shorten the period or keep away from "
             "taut rods"
         )
     function = _buffered(plant.robot.n_rods, threading.get_ident())

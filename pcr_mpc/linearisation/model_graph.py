@@ -8,8 +8,8 @@ from typing import Any
 
 import casadi as ca
 
-from ..plant.mass_matrix import robot_mass
-from ..plant.rod_method import warm_step
+from ..plant.mass_matrix import mass_calls
+from ..plant.rod_method import warm_calls
 from ..plant.step_graph import StepModel
 from ..plant.weight import robot_weight
 from .linearise import discretisation
@@ -24,7 +24,7 @@ class Sizes:
     memory : int
         What the rods start from; the first part of a record.
     record : int
-        All about the rods at the pose (see `warm_step`).
+        All about the rods at the pose (see `warm_calls`).
     model : int
         A, c, B and E, column by column.
     """
@@ -48,15 +48,14 @@ def force_graph(model: StepModel, iterations: int) -> Any:
     Returns
     -------
     casadi.Function
-        ([p, q] (2 + n), memory, numbers) -> record, verdict (5) (see `warm_step`), F (2) [N], K (2, 2) [N/m],
+        ([p, q] (2 + n), memory, numbers) -> record, verdict (5) (see `warm_calls`), F (2) [N], K (2, 2) [N/m],
         G (2, n) [N/rad].
     """
     kind, n = model.kind, model.kind.n_rods
-    symbol = _symbol(model, iterations)
-    target, memory = symbol("target", 2 + n), symbol("memory", sizes(model).memory)
-    vector = symbol("numbers", kind.size)
+    target, memory = ca.MX.sym("target", 2 + n), ca.MX.sym("memory", sizes(model).memory)
+    vector = ca.MX.sym("numbers", kind.size)
     of_rods = vector if model.weight == "exact" else kind.weightless(vector)
-    record, verdict, result = warm_step(kind, model.method, iterations)(target, memory, of_rods)
+    record, verdict, result = warm_calls(kind, model.method, iterations)(target, memory, of_rods)
     force, k, g = result[:2], ca.reshape(result[2:6], 2, 2), ca.reshape(result[6:], 2, n)
     if model.weight == "condensed":
         unknowns = ca.reshape(record[: model.method.newton.size1_in(0) * n], -1, n)
@@ -79,10 +78,9 @@ def model_graph(model: StepModel, iterations: int) -> Any:
         the inertia is "constant", and not used otherwise.
     """
     kind, n = model.kind, model.kind.n_rods
-    symbol = _symbol(model, iterations)
-    x, f_ext, payload = symbol("x", 4 + n), symbol("f_ext", 2), symbol("payload")
-    memory, vector = symbol("memory", sizes(model).memory), symbol("numbers", kind.size)
-    constant, dt = symbol("mass", 2 + n, 2 + n), symbol("dt")
+    x, f_ext, payload = ca.MX.sym("x", 4 + n), ca.MX.sym("f_ext", 2), ca.MX.sym("payload")
+    memory, vector = ca.MX.sym("memory", sizes(model).memory), ca.MX.sym("numbers", kind.size)
+    constant, dt = ca.MX.sym("mass", 2 + n, 2 + n), ca.MX.sym("dt")
     numbers = kind.unpack(vector)
     record, verdict, force, k, g = force_graph(model, iterations)(ca.vertcat(x[:2], x[4:]), memory, vector)
     tip = numbers.tip_mass + payload
@@ -94,7 +92,7 @@ def model_graph(model: StepModel, iterations: int) -> Any:
     else:
         of_rods = vector if model.weight == "exact" else kind.weightless(vector)
         unknowns = ca.reshape(record[: model.method.newton.size1_in(0) * n], -1, n)
-        mass, slopes = robot_mass(kind, model.method)(unknowns, x[4:], of_rods)
+        mass, slopes = mass_calls(kind, model.method)(unknowns, x[4:], of_rods)
     if model.inertia != "none":
         mass = mass + ca.diag(ca.vertcat(payload, payload, ca.DM.zeros(n)))
     push = force - f_ext - tip * numbers.gravity
@@ -105,10 +103,3 @@ def model_graph(model: StepModel, iterations: int) -> Any:
         [record, packed, ca.vertcat(verdict, stiffness, damping**2)],
     )  # fmt: skip
 
-
-def _symbol(model: StepModel, iterations: int) -> Any:
-    """SX where all the parts are, so that the whole is one list of instructions; else MX."""
-    graphs = [warm_step(model.kind, model.method, iterations)]
-    if model.inertia == "condensed":
-        graphs.append(robot_mass(model.kind, model.method))
-    return (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym

@@ -67,6 +67,12 @@ class CondensedMass:
 
 @lru_cache(maxsize=16)
 def robot_mass(kind: Kind, method: RodMethod) -> Any:
+    """`mass_calls` as one list of instructions, if that is not too long."""
+    return inlined(mass_calls(kind, method), method.mass())
+
+
+@lru_cache(maxsize=16)
+def mass_calls(kind: Kind, method: RodMethod) -> Any:
     """Graph of the mass matrix.
 
     Returns
@@ -89,4 +95,4 @@ def robot_mass(kind: Kind, method: RodMethod) -> Any:
         places = [row + (2 + n) * column for column in own for row in own]
         mass[own, own] += scale * rod_matrix
         slopes[places, own] += rod_slopes
-    return inlined(ca.Function("robot_mass", [unknowns, q, vector], [ca.densify(mass), ca.densify(slopes)]), of_rod)
+    return ca.Function("robot_mass", [unknowns, q, vector], [ca.densify(mass), ca.densify(slopes)])

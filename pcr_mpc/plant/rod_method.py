@@ -136,6 +136,12 @@ def closed_form_method() -> RodMethod:
 
 @lru_cache(maxsize=16)
 def warm_step(kind: Kind, method: RodMethod, iterations: int) -> Any:
+    """`warm_calls` as one list of instructions, if that is not too long: a fifth faster, and slow to compile."""
+    return inlined(warm_calls(kind, method, iterations), method.newton)
+
+
+@lru_cache(maxsize=16)
+def warm_calls(kind: Kind, method: RodMethod, iterations: int) -> Any:
     """Tangent predictor, a fixed number of Newton iterations and the verdict, for the whole robot in one graph.
 
     Nothing is decided in here: the caller reads the verdict, and keeps the result or takes the slow way. After a
@@ -190,8 +196,7 @@ def warm_step(kind: Kind, method: RodMethod, iterations: int) -> Any:
     verdict = ca.vertcat(sum(residuals), sum(roughest), sum(changes), conjugate_points, drift)
     record = ca.vertcat(*(ca.vec(ca.horzcat(*found)) for found in columns.values()))
     result = ca.vertcat(force, ca.vec(k), ca.vec(ca.horzcat(*g)))
-    function = ca.Function("warm_step", [target, start_record, vector], [record, verdict, result])
-    return inlined(function, method.newton)
+    return ca.Function("warm_step", [target, start_record, vector], [record, verdict, result])
 
 
 def inlined(function: Any, of_rod: Any) -> Any:

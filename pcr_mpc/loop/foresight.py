@@ -1,0 +1,159 @@
+"""What a controller knows at the start of a decision: where commands take the robot, and linear models from there on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..buffered import BufferedFunction
+from ..errors import ConvergenceError
+from ..linearisation.linearise import linearise
+from ..plant.dynamics import Plant
+from ..plant.equilibrium import Equilibrium
+from .foresight_graph import Places, foresight_graph
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """Result of a `Foresight`: views of its memory, valid until its next call.
+
+    Attributes
+    ----------
+    estimate : ndarray, shape (6 + n,)
+        State and force after the measurement.
+    ahead : ndarray, shape (4 + n,)
+        State when the decision reaches the motors.
+    arriving : ndarray, shape (4 + n,)
+        State at the end of the period; without a delay the one at its start.
+    models : ndarray, shape (size, 1 or N)
+        From there on, as columns (see `model_graph`).
+    record : ndarray
+        Of the rods there (see `warm_calls`).
+    shift : ndarray, shape (n,)
+        Added to the angles of the reference [rad].
+    states : ndarray, shape (N, 4 + n)
+        The reference with that.
+    qp : list of ndarray
+        P, q, l, u, if wanted.
+    """
+
+    estimate: np.ndarray
+    ahead: np.ndarray
+    arriving: np.ndarray
+    models: np.ndarray
+    record: np.ndarray
+    shift: np.ndarray
+    states: np.ndarray
+    qp: list[np.ndarray]
+
+
+class Foresight:
+    """`foresight_graph` with its memory: the rods at every place, and the motor target.
+
+    Rods that one or two Newton iterations do not bring along take the ladder of `Plant`.
+
+    Parameters
+    ----------
+    plant, target : Plant
+        The one that is linearised, and the one whose rods carry the observed force.
+    places : Places
+    period : float
+        [s].
+    condense : casadi.Function or None
+        See `condensing`.
+    compiled : callable or None
+        Makes machine code of the graph.
+
+    Attributes
+    ----------
+    inputs : dict of str to ndarray
+        Of the graph: what a caller writes before a call.
+    """
+
+    def __init__(
+        self, plant: Plant, target: Plant, places: Places, period: float, condense: Any | None, compiled: Any = None
+    ) -> None:
+        assert plant.step_model is not None
+        assert target.step_model is not None
+        self._plant, self._target_plant, self._places, self._period = plant, target, places, period
+        graph = foresight_graph(plant.step_model, target.step_model, places, condense)
+        self._graph = BufferedFunction(graph if compiled is None else compiled(graph))
+        self.inputs = dict(zip(graph.name_in(), self._graph.inputs, strict=True))
+        self._outputs = dict(zip(graph.name_out(), self._graph.outputs, strict=True))
+        self.inputs["dt"][:] = period
+        self.inputs["target_numbers"][:] = target.numbers
+        found, first = self._outputs, places.delay
+        self._outlook = Outlook(
+            estimate=found["corrected"],
+            ahead=_column(found["places"], first),
+            arriving=found["arriving"],
+            models=found["models"].reshape(-1, places.count, order="F")[:, first:],
+            record=_column(found["followed"], first),
+            shift=found["moved_shift"],
+            states=found["wanted"].reshape(-1, places.horizon, order="F").T,
+            qp=[found[name] for name in ("P", "q", "l", "u") if name in found],
+        )
+
+    def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
+        """All rods are in ``pose``, and there is no force."""
+        self._plant.reset(x, pose)
+        self._target_plant.reset(x, pose)
+        self.inputs["numbers"][:] = self._plant.numbers
+        self.inputs["mass"][:] = self._plant.mass(x[:2], x[4:])[0]
+        self.inputs["target"][:] = self._target_plant.record
+        self.inputs["shift"][:] = 0.0
+        records = self.inputs["records"]
+        records.reshape(len(self._plant.record), -1, order="F")[:] = self._plant.record[:, None]
+
+    def __call__(self) -> Outlook:
+        """Evaluate for the inputs, and keep the rods for the next period.
+
+        Raises
+        ------
+        UnreachableError, ConvergenceError, UnstableError, ValueError
+            As `linearise`, at one of the places; the rods are then where they were.
+        """
+        good = self._outputs["good"]
+        self._graph()
+        if good.min() < 1.0:
+            self._bring_along()
+        inputs, found = self.inputs, self._outputs
+        size = len(self._plant.record)
+        # In the next period each place is where its neighbour is now.
+        records, followed = (block.ravel(order="F") for block in (inputs["records"], found["followed"]))
+        records[:-size], records[-size:] = followed[size:], followed[-size:]
+        inputs["target"][:], inputs["shift"][:] = found["followed_target"], found["moved_shift"]
+        return self._outlook
+
+    def _bring_along(self) -> None:
+        """Take the ladder for the rods that have not followed, one place after the other."""
+        good, found = self._outputs["good"], self._outputs
+        records = self.inputs["records"].reshape(len(self._plant.record), -1, order="F")
+        places = found["places"].reshape(-1, self._places.count, order="F")
+        payloads, force = self.inputs["payloads"].ravel(), found["corrected"][-2:]
+        for j in range(self._places.count):
+            if good[j] < 1.0:
+                self._plant.recall(records[:, j])
+                x = places[:, j].copy()
+                self._plant.carry(float(payloads[j]), x)
+                linearise(self._plant, x, np.zeros(len(x) - 4), self._period, force)
+                records[:, j] = self._plant.record
+                # What comes after stands on this place.
+                self._graph()
+                if good[j] < 1.0:
+                    raise ConvergenceError(
+                        f"no linear model at p = {x[:2]} m, q = {x[4:]} rad, {j} periods ahead: the rods get there, and "
+                        "do not stay; keep away from this pose",
+                        residual=float("nan"), iterations=0, last=x,
+                    )  # fmt: skip
+        if good[-1] < 1.0:
+            self._follow_target()
+
+    def _follow_target(self) -> None:
+        raise NotImplementedError
+
+
+def _column(block: np.ndarray, j: int) -> np.ndarray:
+    return block if block.ndim == 1 else block[:, j]

@@ -1,0 +1,173 @@
+"""The first half of a control step as one graph: from what is measured to linear models along the plan, and to the QP.
+
+The estimate is corrected, the commands on the way are applied, and the rods are taken along to every place that needs a
+linear model: one for each period of delay, one where the robot will then be, one for each later period of the last plan.
+These places are a line in time: in the next control period each is where its neighbour is now, so that the rods of a place
+start from its neighbour's, and only the last of them has a way to go.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+
+from ..linearisation.linearise import STIFFEST
+from ..linearisation.model_graph import force_graph, model_graph, sizes
+from ..plant.rod_follower import BRANCH_CHANGE
+from ..plant.step_graph import LARGEST_DRIFT, StepModel
+
+# What a verdict of `model_graph` may be: the pose is solved far better than a controller can tell, K and G to 1e-4.
+_SOLVED, _DERIVATIVES = 1e-8, 1e-4
+_LARGEST_STEP = 0.1  # of the motor target in a period [rad]
+_VERDICT = [_SOLVED, _DERIVATIVES, BRANCH_CHANGE, 0.0, LARGEST_DRIFT]
+_SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
+
+
+@dataclass(frozen=True)
+class Places:
+    """How many places need a linear model.
+
+    Attributes
+    ----------
+    delay : int
+        Periods that commands are on the way.
+    models : int
+        Of the plan: 1, or its horizon.
+    horizon : int
+        Of the reference window.
+    """
+
+    delay: int
+    models: int
+    horizon: int
+
+    @property
+    def count(self) -> int:
+        """All of them."""
+        return self.delay + self.models
+
+
+def foresight_graph(model: StepModel, target: StepModel, places: Places, condense: Any | None) -> Any:
+    """Build the graph.
+
+    Parameters
+    ----------
+    model, target : StepModel
+        Of the plant that is linearised, and of the one whose rods carry the observed force.
+    places : Places
+    condense : casadi.Function or None
+        See `condensing`. None: no QP is wanted.
+
+    Returns
+    -------
+    casadi.Function
+        With named inputs and outputs; one column of ``followed`` (records) and ``models`` for each place. ``good`` is 1 for each
+        place, and then for the motor target, whose rods have followed, else 0.
+    """
+    n, count = model.kind.n_rods, places.count
+    size, of_target = sizes(model), sizes(target)
+    inputs = {
+        "estimate": ca.MX.sym("estimate", 6 + n),  # x, force
+        "measured": ca.MX.sym("measured", 2 + n),  # p, q
+        "on_the_way": ca.MX.sym("on_the_way", n, places.delay),
+        "u_previous": ca.MX.sym("u_previous", n),
+        "path": ca.MX.sym("path", 4 + n, places.models - 1),  # of the last plan, from the second place on
+        "states": ca.MX.sym("states", 4 + n, places.horizon),  # of the reference
+        "inputs": ca.MX.sym("inputs", n, places.horizon),
+        "end_force": ca.MX.sym("end_force", 2),  # that the rods carry at the end of the reference
+        "payloads": ca.MX.sym("payloads", 1, count),
+        "records": ca.MX.sym("records", size.record, count),
+        "target": ca.MX.sym("target", of_target.record),
+        "shift": ca.MX.sym("shift", n),
+        "numbers": ca.MX.sym("numbers", model.kind.size),
+        "target_numbers": ca.MX.sym("target_numbers", target.kind.size),
+        "mass": ca.MX.sym("mass", 2 + n, 2 + n),
+        "gain": ca.MX.sym("gain", 6, 2),
+        "half_step": ca.MX.sym("half_step"),
+        "weights": ca.MX.sym("weights", 4),
+        "terminal": ca.MX.sym("terminal", 4 + n, 4 + n),
+        "bounds": ca.MX.sym("bounds", n, 4),
+        "dt": ca.MX.sym("dt"),
+    }
+    given = SimpleNamespace(**inputs)
+    x, force = _corrected(given, n)
+    found = [_place(model, given, x, force, 0, last=count == 1)]
+    ahead = arriving = x
+    for j in range(places.delay):
+        ahead = _moved(found[j][1], ahead, given.on_the_way[:, j], n)
+        arriving = ahead if j == 0 else arriving
+        found.append(_place(model, given, ahead, force, j + 1, last=j + 1 == count - 1))
+    for j in range(places.delay + 1, count):
+        there = given.path[:, j - places.delay - 1]
+        found.append(_place(model, given, there, force, j, last=j == count - 1))
+    records, models, good, states_of = (ca.horzcat(*columns) for columns in zip(*found, strict=True))
+    shift, target_record, target_good = _shifted(target, given, force, n)
+    states = given.states + ca.vertcat(ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon))
+    outputs = {
+        "good": ca.vertcat(good.T, target_good), "corrected": ca.vertcat(x, force), "arriving": arriving, "places": states_of,
+        "followed": records, "models": models, "moved_shift": shift, "followed_target": target_record, "wanted": states,
+    }  # fmt: skip
+    if condense is not None:
+        of_plan = models[:, places.delay :]
+        outputs |= zip(
+            ("P", "q", "l", "u"),
+            condense(of_plan, ahead, states, given.inputs, given.u_previous, given.weights, given.terminal,
+                     given.bounds, given.dt),
+            strict=True,
+        )  # fmt: skip
+    return ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
+
+
+def _corrected(given: Any, n: int) -> tuple[Any, Any]:
+    """State and force after the measurement (see `DisturbanceObserver.correct`)."""
+    x, force = given.estimate[: 4 + n], given.estimate[4 + n :]
+    change = given.gain @ (given.measured[:2] - x[:2])
+    least, most = given.measured[2:] - given.half_step, given.measured[2:] + given.half_step
+    angles = ca.fmin(ca.fmax(x[4:], least), most)
+    return ca.vertcat(x[:4] + change[:4], angles), force + change[4:]
+
+
+def _place(model: StepModel, given: Any, x: Any, force: Any, j: int, *, last: bool) -> tuple[Any, ...]:
+    """Record and linear model of place j, whether its rods have followed, and x, where it is."""
+    memory = given.records[: sizes(model).memory, j]
+    graph = model_graph(model, 2 if last else 1)
+    record, packed, verdict = graph(x, force, given.payloads[j], memory, given.numbers, given.mass, given.dt)
+    return record, packed, _kept(verdict, [*_VERDICT, STIFFEST, STIFFEST]), x
+
+
+def _kept(verdict: Any, limits: list[float]) -> Any:
+    """1 where no entry exceeds its limit; NaN does."""
+    return ca.mmin(verdict <= ca.DM(limits))
+
+
+def _moved(packed: Any, x: Any, u: Any, n: int) -> Any:
+    """State one period later by a linear model."""
+    n_states = 4 + n
+    ends = [0, n_states**2, n_states * (n_states + 1), n_states * (n_states + 1 + n), packed.size1()]
+    a, c, b, _ = ca.vertsplit(packed, ends)
+    return ca.reshape(a, n_states, n_states) @ x + ca.reshape(b, n_states, n) @ u + c
+
+
+def _shifted(target: StepModel, given: Any, force: Any, n: int) -> tuple[Any, Any, Any]:
+    """Angles to add to those of the reference so that the rods carry the observed force too, at the end of the window.
+
+    One Newton iteration a period: where tip and force do not change it converges, which is what makes the controller
+    free of offset under a constant load. The least motion does it, G'(G G')^-1, two by two however many motors there are.
+    """
+    end = given.states[:, -1]
+    pose = ca.vertcat(end[:2], end[4:] + given.shift)
+    memory = given.target[: sizes(target).memory]
+    record, verdict, found, _, g = force_graph(target, 1)(pose, memory, given.target_numbers)
+    good = _kept(verdict, [_DERIVATIVES, *_VERDICT[1:]])
+    numbers = target.kind.unpack(given.target_numbers)
+    square = g @ g.T
+    a, b, d = square[0, 0], square[0, 1], square[1, 1]
+    determinant = a * d - b * b
+    missing = given.end_force + force + numbers.tip_mass * numbers.gravity - found
+    step = g.T @ ca.vertcat(d * missing[0] - b * missing[1], a * missing[1] - b * missing[0]) / determinant
+    step = step * ca.fmin(1, _LARGEST_STEP / ca.fmax(ca.norm_inf(step), 1e-300))
+    moves = ca.logic_and(good, determinant >= _SINGULAR * a * d)
+    return ca.if_else(moves, given.shift + step, given.shift), ca.if_else(good, record, given.target), good
