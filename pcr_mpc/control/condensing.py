@@ -53,7 +53,11 @@ def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool
     """
     n_states = 4 + n
     packed = ca.MX.sym("models", n_states * (n_states + 1 + n + 2), models)
-    x, states, inputs = ca.MX.sym("x", n_states), ca.MX.sym("states", n_states, horizon), ca.MX.sym("inputs", n, horizon)
+    x, states, inputs = (
+        ca.MX.sym("x", n_states),
+        ca.MX.sym("states", n_states, horizon),
+        ca.MX.sym("inputs", n, horizon),
+    )
     previous, weights = ca.MX.sym("previous", n), ca.MX.sym("weights", 4)
     terminal, bounds, dt = ca.MX.sym("terminal", n_states, n_states), ca.MX.sym("bounds", n, 4), ca.MX.sym("dt")
     model = _Models(packed, horizon, n, dt)

@@ -102,4 +102,3 @@ def model_graph(model: StepModel, iterations: int) -> Any:
         "model", [x, f_ext, payload, memory, vector, constant, dt],
         [record, packed, ca.vertcat(verdict, stiffness, damping**2)],
     )  # fmt: skip
-

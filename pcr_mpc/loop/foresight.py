@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..buffered import BufferedFunction
-from ..errors import ConvergenceError
+from ..errors import ConvergenceError, PCRError
 from ..linearisation.linearise import linearise
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
@@ -152,7 +153,14 @@ class Foresight:
             self._follow_target()
 
     def _follow_target(self) -> None:
-        raise NotImplementedError
+        """Take the ladder for the rods of the motor target; where it leads nowhere, they stay where they are."""
+        inputs, plant = self.inputs, self._target_plant
+        end = inputs["states"].reshape(-1, self._places.horizon, order="F")[:, -1]
+        plant.recall(inputs["target"])
+        with suppress(PCRError):
+            plant.force(end[:2], end[4:] + inputs["shift"])
+            inputs["target"][:] = plant.record
+            self._graph()
 
 
 def _column(block: np.ndarray, j: int) -> np.ndarray:

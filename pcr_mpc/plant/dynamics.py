@@ -266,6 +266,23 @@ class Plant:
             raise
         return np.asarray(end)
 
+    @property
+    def record(self) -> np.ndarray:
+        """All about the rods at the last pose that was solved, in one vector (see `recall`)."""
+        if not isinstance(self._solver, RodSolver):
+            raise ValueError(f"method {self.method} keeps no record")
+        if self._quick is not None:
+            self._quick.hand_over()
+        return self._solver.state.record
+
+    def recall(self, record: np.ndarray) -> None:
+        """Put the rods back to a pose whose ``record`` was copied."""
+        assert isinstance(self._solver, RodSolver)
+        if self._quick is not None:
+            self._quick.hand_over()
+        self._at = None
+        self._solver.recall(record)
+
     def memory(self, x: np.ndarray) -> np.ndarray:
         """Return what a `step_graph` of ``step_model`` starts from at state x, following the branch."""
         assert self.step_model is not None

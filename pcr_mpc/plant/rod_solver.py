@@ -204,6 +204,12 @@ class RodSolver:
         self._spare.take(record, result, drift, residual, iterations)
         self._state, self._spare = self._spare, self._state
 
+    def recall(self, record: np.ndarray) -> None:
+        """Go on from a pose whose ``state.record`` was copied."""
+        assert self._spare is not None
+        self._spare.recall(record)
+        self._state, self._spare = self._spare, self._state
+
     def go_back(self) -> None:
         """Undo the last `move`."""
         del self.snaps[self._snaps_before :]

@@ -62,10 +62,14 @@ class RobotState:
         self.rung = max((rod.rung for rod in rods), key=RUNGS.index)
         self.drift = float(np.abs(self.scalars[4]).sum())
         self.unstable_rods = tuple(i for i, count in enumerate(self.scalars[3].tolist()) if count)
-        units = robot.stiffnesses / robot.lengths**2
-        moves = self.load_tangents[:2].reshape(2, -1, 3)
-        k = np.einsum("ijk,j->ik", moves[:, :, :2], units / robot.lengths)
-        self._keep(np.concatenate([self.loads[:2] @ units, k.ravel(order="F"), (moves[:, :, 2] * units).ravel("F")]))
+        self._units, self._lengths = robot.stiffnesses / robot.lengths**2, robot.lengths
+        self._keep(self._result(self.loads, self.load_tangents[:2].reshape(2, -1, 3)))
+
+    def _result(self, loads: np.ndarray, moves: np.ndarray) -> np.ndarray:
+        """F, K and G as `warm_calls` gives them."""
+        units = self._units
+        k = np.einsum("ijk,j->ik", moves[:, :, :2], units / self._lengths)
+        return np.concatenate([loads[:2] @ units, k.ravel(order="F"), (moves[:, :, 2] * units).ravel("F")])
 
     def _keep(self, result: np.ndarray) -> None:
         # The views are read-only because what they show is.
@@ -81,6 +85,18 @@ class RobotState:
         self.iterations = iterations
         self.rung = "warm"
         self.unstable_rods = ()
+
+    @property
+    def record(self) -> np.ndarray:
+        """All of it in one piece; valid until the next change."""
+        return self._record
+
+    def recall(self, record: np.ndarray) -> None:
+        """Go back to a pose whose ``record`` was copied; it was solved, and stable."""
+        n = len(self._units)
+        moves = record[-(9 + 5) * n : -5 * n].reshape(3, -1, order="F")[:2].reshape(2, -1, 3)
+        loads = record[-(3 + 9 + 5) * n : -(9 + 5) * n].reshape(3, -1, order="F")
+        self.take(record, self._result(loads, moves), drift=0.0, residual=0.0, iterations=0)
 
     def rods(self) -> list[RodState]:
         """Split into rods."""
