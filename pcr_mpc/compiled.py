@@ -1,7 +1,7 @@
 """CasADi functions as machine code, where there is a C compiler: a third of the time of CasADi's own interpreter.
 
-What is built is kept in the user's cache folder, ``$XDG_CACHE_HOME/pcr_mpc`` or ``~/.cache/pcr_mpc``, under a name made of
-the source, the compiler, its flags, and the library's own digest: a change of any of them builds anew, two processes
+What is built is kept in the user's cache folder, ``$XDG_CACHE_HOME/pcr_mpc`` or ``~/.cache/pcr_mpc``, under a name made
+of the source, the compiler, its flags, and the library's own digest: a change of any of them builds anew, two processes
 that build at once do not meet, and a file that is not what its name says is not loaded.
 """
 
