@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..buffered import building
 from ..frozen import freeze
 from .tuning import Limits, Tuning
 
@@ -55,6 +56,7 @@ def gauss_tableau(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (c[:, None] ** powers / powers) @ from_values, (1.0 / powers) @ from_values, c
 
 
+@building
 def transcribe(dynamics: Any, tuning: Tuning, limits: Limits, dt: float, points: int) -> Transcription:
     """Write the MPC problem of `build_qp` for nonlinear dynamics.
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import threading
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache, per_thread
 from ..errors import checked_number, checked_vector
 from ..plant.dynamics import DERIVATIVE_ACCURACY, Plant
 from .linear_model import LinearModel
@@ -66,7 +64,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
             f"and (c dt/m)^2 is {damping * damping:.3g}, at most {_STIFFEST:g}; shorten the period or keep away from "
             "taut rods"
         )
-    function = _discretisation(plant.robot.n_rods, threading.get_ident())
+    function = _discretisation(plant.robot.n_rods)
     function.inputs[0][:] = k
     function.inputs[1][:] = g
     function.inputs[2][:] = force - f_ext - plant.tip_weight
@@ -83,8 +81,13 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     return LinearModel(a, b, c, e, dt, f_ext.copy())
 
 
-@lru_cache(maxsize=32)
-def _discretisation(n: int, thread: int) -> BufferedFunction:
+@per_thread(maxsize=32)
+def _discretisation(n: int) -> BufferedFunction:
+    return BufferedFunction(_discretisation_graph(n))
+
+
+@graph_cache(maxsize=32)
+def _discretisation_graph(n: int) -> Any:
     """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q)) -> [A, c, B, E],
     column by column in one vector."""
     k, g, force = ca.SX.sym("K", 2, 2), ca.SX.sym("G", 2, n), ca.SX.sym("F", 2)
@@ -138,4 +141,4 @@ def _discretisation(n: int, thread: int) -> BufferedFunction:
     e_matrix = ca.vertcat(ca.diag(units) @ phi_1 @ scale, ca.SX(n, 2))
     results = [ca.vertcat(ca.vec(a_matrix), c_vector, ca.vec(b_matrix), ca.vec(e_matrix))]
     arguments = [k, g, force, x, parameters, mass, slopes]
-    return BufferedFunction(ca.Function("discretise", arguments, results, {"cse": True}))
+    return ca.Function("discretise", arguments, results, {"cse": True})

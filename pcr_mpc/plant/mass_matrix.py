@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache
 from ..errors import ConvergenceError
 from ..frozen import read_only
 from .robot import Robot
@@ -62,7 +61,7 @@ class CondensedMass:
         return read_only(mass), read_only(slopes)
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def robot_mass(robot: Robot, method: RodMethod) -> Any:
     """Graph of the mass matrix.
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..buffered import graph_cache
 from . import elastica, inertia, multiple_shooting, shooting_inertia
 from .chart import HeldShape
 from .robot import Robot
@@ -89,7 +89,7 @@ class RodMethod:
         return None if self.physics is None else self.physics[rod]
 
 
-@lru_cache
+@graph_cache()
 def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
     """Multiple shooting, paper sec. 4, for any rods; the unknowns are the nodes."""
     n, physics = shooting.segments, robot_physics(robot)
@@ -120,7 +120,7 @@ def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
     )
 
 
-@lru_cache
+@graph_cache()
 def closed_form_method() -> RodMethod:
     """Elliptic functions: exact for the uniform, straight, weightless rods that a `Robot` describes."""
     newton, residual = elastica.rod_newton()
@@ -140,7 +140,7 @@ def closed_form_method() -> RodMethod:
     )
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     """Tangent predictor, a fixed number of Newton iterations and the verdict, for the whole robot in one graph.
 

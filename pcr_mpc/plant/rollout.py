@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache, per_thread
 from ..errors import PCRError, checked_array
 from ..frozen import freeze
 from .dynamics import Plant
@@ -154,7 +152,7 @@ def _moved(
     for first in range(0, steps, _STEPS):
         block = slice(first, min(steps, first + _STEPS))
         length = block.stop - first
-        graph = _many_steps(model, length, robots, *settings, threading.get_ident())
+        graph = _many_steps(model, length, robots, *settings)
         # CasADi puts robots and steps side by side, column by column: rows of these views.
         memory, start, told = (place.T.reshape(robots, -1) for place in graph.inputs)
         results = [place.T.reshape(robots, length, -1) for place in graph.outputs]
@@ -166,16 +164,20 @@ def _moved(
     return x, verdicts[:, :, 0], np.asarray(good)
 
 
-@lru_cache(maxsize=8)
+@per_thread(maxsize=8)
 def _many_steps(
-    model: StepModel, steps: int, robots: int, corrections: int, compiled: bool, threads: int, caller: int
+    model: StepModel, steps: int, robots: int, corrections: int, compiled: bool, threads: int
 ) -> BufferedFunction:
-    """One graph for each thread of the caller's: its buffers are shared memory."""
+    return BufferedFunction(_many_steps_graph(model, steps, robots, corrections, compiled, threads))
+
+
+@graph_cache(maxsize=8)
+def _many_steps_graph(model: StepModel, steps: int, robots: int, corrections: int, compiled: bool, threads: int) -> Any:
     step = step_function(model, corrections, details=False, compiled=compiled)
     graph = step.mapaccum("steps", steps, 2, {})
     if robots > 1:
         graph = graph.map(robots, "thread", threads) if threads > 1 else graph.map(robots, "serial")
-    return BufferedFunction(graph)
+    return graph
 
 
 def _stepped(

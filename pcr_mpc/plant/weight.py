@@ -12,13 +12,12 @@ centreline is that of the closed form (see `elastica`), its unknowns follow (p, 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache
 from .elastica import pendulum
 from .equilibrium import Equilibrium
 from .robot import Robot
@@ -69,7 +68,7 @@ class CondensedWeight:
         return graph.outputs
 
 
-@lru_cache
+@graph_cache()
 def _rod_weight() -> tuple[Any, Any]:
     """Graphs of one rod of unit length and unit weight.
 
@@ -112,7 +111,7 @@ def _rod_weight() -> tuple[Any, Any]:
     )
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def robot_weight(robot: Robot) -> tuple[Any, Any]:
     """Graphs of a robot: (unknowns (3, n), q (n)) -> U_g [J] and dU_g/d(p, q) (2 + n); and its second derivatives."""
     n = robot.n_rods
