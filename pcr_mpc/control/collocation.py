@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 
 from ..buffered import building
-from ..frozen import freeze
+from ..frozen import Frozen
 from .tuning import Limits, Tuning
 
 
 @dataclass(frozen=True, eq=False)
-class Transcription:
+class Transcription(Frozen):
     """NLP of one horizon; it is the same for every control step, but for its parameters.
 
     The unknowns are, period after period, one row of [u (n), (acceleration (2), z (2n)) at each Gauss point, state
@@ -43,9 +43,6 @@ class Transcription:
     g_lower: np.ndarray
     g_upper: np.ndarray
     nodes: np.ndarray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def gauss_tableau(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

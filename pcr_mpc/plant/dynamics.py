@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConvergenceError, PCRError, UnstableError, checked_number, checked_vector
-from ..frozen import read_only
+from ..frozen import Remade, read_only, set_once
 from .equilibrium import Equilibrium
 from .integrators import INTEGRATORS
 from .mass_matrix import CondensedMass, MassMatrix, tip_mass
@@ -26,7 +26,21 @@ from .weight import CondensedWeight
 DERIVATIVE_ACCURACY = 1e-6
 
 
-class Plant:
+@set_once(
+    "make a new Plant with it",
+    "robot",
+    "method",
+    "shooting",
+    "inertia",
+    "weight",
+    "integrator",
+    "dt",
+    "compiled",
+    "n_states",
+    "step_model",
+    payload="call carry, which keeps the momentum, or reset, which takes it away",
+)
+class Plant(Remade):
     """The robot in motion: m p'' + c p' = -F(p, q) + m g + F_ext, motor angles driven by their rates.
 
     The state is x = [p (2), v (2), q (n)] in [m, m/s, rad], the input u = q' (n) in rad/s.
@@ -68,7 +82,8 @@ class Plant:
     A state does not say on which branch the rods are, so the plant follows them by continuity from one call
     to the next; `reset` starts elsewhere. Motors saturate: rates are clipped to the limit and angles stop at
     theirs. (The limit on the change of rate concerns commands, and is the controller's.) What the tip carries besides
-    its own mass is the plant's ``payload`` [kg], see `carry`.
+    its own mass is the plant's ``payload`` [kg], see `carry`. What the plant was made of can be read and not set. A
+    pickled or copied plant is made of the same, and starts with a `reset`.
 
     A motor's rate jumps from one step to the next, and a rod's mass makes that an impulse on the tip: the momentum
     M_pp p' + M_pq u has no jump, p' has one. The state's v is therefore M_pp^-1 times the momentum: the velocity
@@ -118,13 +133,14 @@ class Plant:
         self.payload = 0.0
         self._tip_weight = robot.tip_weight
         self._condensed: CondensedMass | None = None
-        self.step_model: StepModel | None = None
+        step_model: StepModel | None = None
         if isinstance(self._solver, RodSolver):
             of_rods = self._solver.method
             if inertia != "none":
                 self._condensed = CondensedMass(robot, of_rods)
             if inertia != "full":
-                self.step_model = StepModel(robot, rods, of_rods, integrator, inertia, weight == "condensed", dt)
+                step_model = StepModel(robot, rods, of_rods, integrator, inertia, weight == "condensed", dt)
+        self.step_model = step_model
         self._quick: QuickStep | None = None
         self._quick_at: list[float] | None = None
 
@@ -184,14 +200,14 @@ class Plant:
         mass, slopes = self._mass
         n = self.robot.n_rods
         self._mass = read_only(mass + np.diag([payload - self.payload] * 2 + [0.0] * n)), slopes
-        self.payload, self._mass_at = payload, None
+        self.__dict__["payload"], self._mass_at = payload, None
         self._tip_weight = self.robot.tip_weight + payload * np.array(self.robot.gravity)
         if self.step_model is not None:
             if self._quick is not None:
                 self._quick.hand_over()
                 self._quick = self._quick_at = None  # its graph has the mass of the tip
             loaded = replace(self.robot, tip_mass=self.robot.tip_mass + payload)
-            self.step_model = replace(self.step_model, robot=loaded)
+            self.__dict__["step_model"] = replace(self.step_model, robot=loaded)
         if self._modal is not None:
             self._modal.rods.tip_mass = self.robot.tip_mass + payload
 

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from ..buffered import graph_cache
+from ..frozen import Frozen
 
 # Explicit Runge-Kutta schemes as (A, b); where a rod's properties change along s, c is the row sums of A.
 SCHEMES: dict[str, tuple[np.ndarray, np.ndarray]] = {
@@ -50,7 +51,7 @@ class Layout:
 
 
 @dataclass(frozen=True, eq=False)
-class RodPhysics:
+class RodPhysics(Frozen):
     """What one rod has beyond the plain rod (uniform, straight, inextensible, weightless), normalised.
 
     Attributes

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..buffered import BufferedFunction, graph_cache, per_thread
 from ..errors import PCRError, checked_array
-from ..frozen import freeze
+from ..frozen import Frozen
 from .dynamics import Plant
 from .equilibrium import Equilibrium
 from .step_graph import CORRECTIONS, StepModel, limits, step_function
@@ -21,7 +21,7 @@ _MOST_STEPS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class Rollout:
+class Rollout(Frozen):
     """Motion of one robot, or of R robots: then every array has an axis of R in front.
 
     Attributes
@@ -41,9 +41,6 @@ class Rollout:
     x: np.ndarray
     residual: np.ndarray
     stepped: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def rollout(
