@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from ..errors import InfeasibleError, PCRError, checked_array, checked_vector
+from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .collocation import Transcription, transcribe
@@ -23,6 +25,9 @@ from .tuning import Limits, Tuning
 _ACTIVE = 1e-4
 
 
+@set_once(
+    "call retune, which lets all of it take effect", "tuning", limits="make a new one: they are part of its problem"
+)
 class NonlinearMPC:
     """Tracks a reference with the exact nonlinear model and hard limits on the motors.
 
@@ -73,10 +78,26 @@ class NonlinearMPC:
         self._age = 0  # periods since the last plan was solved
         self._point: Point | None = None
         self._terminal_weight = None
+        self._prepared: LinearModel | None = None
+
+    def retune(self, tuning: Tuning) -> None:
+        """Let another tuning take effect, all of it, between two steps; the last rates remain, for a fall-back."""
+        new = NonlinearMPC(tuning, self.limits, self._dynamics, self._algebraic, points=self._points,
+                           max_iterations=self._max_iterations)  # fmt: skip
+        if self._prepared is not None:
+            new.prepare(self._prepared)
+        if self._last is not None:
+            new._last, new._age = self._last.spanning(tuning.horizon), self._age
+        self.__dict__.update(new.__dict__)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "NonlinearMPC holds a function, and can be neither pickled nor copied: pickle its controller instead"
+        )
 
     def prepare(self, model: LinearModel, combinations: Sequence[tuple[str, ...]] = ()) -> None:
         """Take the terminal weight from ``model`` and build the NLP; else the first `solve` does it."""
-        self._terminal_weight = terminal_weight(model, self.tuning)
+        self._terminal_weight, self._prepared = terminal_weight(model, self.tuning), model
         if self._nlp is None:
             self._dt = model.dt
             self._nlp = transcribe(self._dynamics, self.tuning, self.limits, model.dt, self._points)
@@ -136,9 +157,16 @@ class NonlinearMPC:
         parameters = np.concatenate([x, force, u_previous, wanted.ravel(), feed_forward.ravel(), weight])
         updated = began
         try:
-            start = self._start(x, reference) if self._point is None else self._point.shifted()
-            updated = time.perf_counter()
-            solution = self._solver.solve(parameters, start)
+            solution = None
+            if self._point is not None:
+                updated = time.perf_counter()
+                # Where the last solution leads nowhere, it must not spoil this one.
+                with suppress(InfeasibleError):
+                    solution = self._solver.solve(parameters, self._point.shifted())
+            if solution is None:
+                start = self._start(x, reference)
+                updated = time.perf_counter()
+                solution = self._solver.solve(parameters, start)
         except PCRError as error:
             self._point = None
             if self.tuning.fallback == "raise":

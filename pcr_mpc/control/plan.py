@@ -55,3 +55,8 @@ class Plan(Frozen):
     update_time: float = 0.0
     solve_time: float = 0.0
     solver_time: float = 0.0
+
+    def spanning(self, horizon: int) -> Plan:
+        """Return its rates over another horizon, the last ones held beyond its end; nothing else of it."""
+        rows = np.minimum(np.arange(horizon), len(self.inputs) - 1)
+        return Plan(self.inputs[rows], None, None, self.status, self.fallback)
