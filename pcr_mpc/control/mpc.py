@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import control
@@ -19,6 +20,7 @@ from .qp import Reference, assemble, model_sequence
 from .tuning import Limits, Tuning
 from .workspace import Workspace
 
+_NOT_OF_THE_PROBLEM = ("name", "fallback", "model", "observer", "pd", "period")  # fields of a tuning
 # Between the sizes of one problem and the next: then the last one says nothing about this one.
 _JUMP = 1e3
 _POSES = 30.0  # at most between entries of linear models of one robot
@@ -87,6 +89,10 @@ class LinearMPC:
         The next plan is that of a new controller, prepared as this one was; the rates of the last one remain, for a
         fall-back. It may take a second where there are graphs to build.
         """
+        others = {name: getattr(self.tuning, name) for name in _NOT_OF_THE_PROBLEM}
+        if replace(tuning, **others) == self.tuning:
+            self.__dict__["tuning"] = tuning
+            return
         new = LinearMPC(tuning, self.limits)
         if self._prepared is not None:
             new.prepare(*self._prepared)
@@ -268,7 +274,7 @@ def lqr_rates(gain: np.ndarray, x: np.ndarray, reference: Reference, dt: float) 
 
 def _another_robot(one: LinearModel, other: LinearModel) -> bool:
     """Whether two models differ by more than poses of one robot do."""
-    sizes = ((float(np.abs(m.A).max()), float(np.abs(m.B).max())) for m in (one, other))
+    sizes = ((float(np.abs(m.A[:4, :4]).max()), float(np.abs(m.B[:4]).max())) for m in (one, other))
     return any(not a / _POSES <= b <= a * _POSES for a, b in zip(*sizes, strict=True))
 
 
