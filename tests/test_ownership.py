@@ -36,7 +36,6 @@ def plant(pair, centre, x0):
         ("weight", "none", "make a new Plant"),
         ("compiled", True, "make a new Plant"),
         ("n_states", 7, "make a new Plant"),
-        ("step_model", None, "make a new Plant"),
     ],
 )
 def test_a_plant_s_settings_are_read_only(plant, name, value, way):
@@ -48,6 +47,24 @@ def test_a_plant_s_settings_are_read_only(plant, name, value, way):
     assert getattr(plant, name) is before
     with pytest.raises(AttributeError):
         delattr(plant, name)
+
+
+def test_the_step_s_model_may_be_taken_away_after_a_step(pair, centre, x0):
+    """Then the step goes its slow way, to the same result."""
+    plants = [Plant(pair), Plant(pair)]
+    ends = []
+    for plant in plants:
+        plant.reset(x0, centre)
+        x = plant.step(x0, (0.3, -0.2))
+        if plant is plants[1]:
+            plant.step_model = None
+        for _ in range(3):
+            x = plant.step(x, (0.3, -0.2))
+        ends.append(x)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-12)
+    # The slow way leaves its pose with the solver, not with the graph of the step.
+    assert plants[1]._at is not plants[1]._quick_at
+    assert plants[0]._at is plants[0]._quick_at
 
 
 def test_payload_is_carried_and_taken_away(plant, x0, centre):

@@ -37,7 +37,6 @@ DERIVATIVE_ACCURACY = 1e-6
     "dt",
     "compiled",
     "n_states",
-    "step_model",
     payload="call carry, which keeps the momentum, or reset, which takes it away",
 )
 class Plant(Remade):
@@ -133,14 +132,13 @@ class Plant(Remade):
         self.payload = 0.0
         self._tip_weight = robot.tip_weight
         self._condensed: CondensedMass | None = None
-        step_model: StepModel | None = None
+        self.step_model: StepModel | None = None
         if isinstance(self._solver, RodSolver):
             of_rods = self._solver.method
             if inertia != "none":
                 self._condensed = CondensedMass(robot, of_rods)
             if inertia != "full":
-                step_model = StepModel(robot, rods, of_rods, integrator, inertia, weight == "condensed", dt)
-        self.step_model = step_model
+                self.step_model = StepModel(robot, rods, of_rods, integrator, inertia, weight == "condensed", dt)
         self._quick: QuickStep | None = None
         self._quick_at: list[float] | None = None
 
@@ -207,7 +205,7 @@ class Plant(Remade):
                 self._quick.hand_over()
                 self._quick = self._quick_at = None  # its graph has the mass of the tip
             loaded = replace(self.robot, tip_mass=self.robot.tip_mass + payload)
-            self.__dict__["step_model"] = replace(self.step_model, robot=loaded)
+            self.step_model = replace(self.step_model, robot=loaded)
         if self._modal is not None:
             self._modal.rods.tip_mass = self.robot.tip_mass + payload
 
@@ -278,10 +276,13 @@ class Plant(Remade):
 
     def _step_quickly(self, x: np.ndarray, u: np.ndarray, f_ext: np.ndarray) -> np.ndarray | None:
         """Step in one call, or None where that is not possible."""
-        if self._quick is None:
-            if self.step_model is None:
-                return None
+        if self.step_model is None:
+            return None
+        if self._quick is None or self._quick.model is not self.step_model:
             assert isinstance(self._solver, RodSolver)
+            if self._quick is not None:
+                self._quick.hand_over()
+                self._quick_at = None
             self._quick = QuickStep(self.step_model, self._solver, compiled=self.compiled)
         at = x.tolist()
         del at[2:4]

@@ -27,7 +27,7 @@ class QuickStep:
     """
 
     def __init__(self, model: StepModel, solver: RodSolver, *, compiled: bool) -> None:
-        self._model, self._solver, self._compiled = model, solver, compiled
+        self.model, self._solver, self._compiled = model, solver, compiled
         self._limits = limits(model)
         self._solves = _SOLVES[model.integrator]
         self._n = model.robot.n_rods
@@ -37,7 +37,7 @@ class QuickStep:
         self._known = True  # to the solver
 
     def _pair(self, corrections: int) -> tuple[BufferedFunction, BufferedFunction]:
-        function = step_function(self._model, corrections, details=True, compiled=self._compiled)
+        function = step_function(self.model, corrections, details=True, compiled=self._compiled)
         return BufferedFunction(function), BufferedFunction(function)
 
     def load(self, memory: np.ndarray) -> None:
