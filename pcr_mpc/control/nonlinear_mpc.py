@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NoReturn
 
@@ -157,12 +156,7 @@ class NonlinearMPC:
         parameters = np.concatenate([x, force, u_previous, wanted.ravel(), feed_forward.ravel(), weight])
         updated = began
         try:
-            solution = None
-            if self._point is not None:
-                updated = time.perf_counter()
-                # Where the last solution leads nowhere, it must not spoil this one.
-                with suppress(InfeasibleError):
-                    solution = self._solver.solve(parameters, self._point.shifted())
+            solution = self._continued(parameters)
             if solution is None:
                 start = self._start(x, reference)
                 updated = time.perf_counter()
@@ -171,7 +165,8 @@ class NonlinearMPC:
             self._point = None
             if self.tuning.fallback == "raise":
                 raise
-            status = error.status if isinstance(error, InfeasibleError) else f"no start: {error}"
+            first = error if self._refused is None else self._refused
+            status = first.status if isinstance(first, InfeasibleError) else f"no start: {first}"
             return self.fall_back(status, x, reference, u_previous)
         self._point, self._age = solution.point, 0
         rows = solution.point.unknowns
@@ -180,6 +175,16 @@ class NonlinearMPC:
         agreeing = replace(model, c=model.c + predicted[1] - model(x, inputs[0]))
         times = updated - began, time.perf_counter() - updated
         return self._remember(inputs, predicted, agreeing, "solved", None, solution, times)
+
+    def _continued(self, parameters: np.ndarray) -> NLPSolution | None:
+        """Solve from the last solution; None where it leads nowhere, for it must not spoil this one."""
+        self._refused: InfeasibleError | None = None
+        if self._point is not None:
+            try:
+                return self._solver.solve(parameters, self._point.shifted())
+            except InfeasibleError as error:
+                self._refused = error
+        return None
 
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """Answer without a solution: because there is none, or no model or no measurement.
