@@ -143,7 +143,7 @@ class LinearMPC:
         horizon = self.tuning.horizon
         wanted = checked_array("reference.states", reference.states, (horizon, n_states))
         feed_forward = checked_array("reference.inputs", reference.inputs, (horizon, n))
-        if self._first is not None and _another_robot(self._first, first):
+        if self._first is not None and first is not self._first and _another_robot(self._first, first):
             self.reset()
         if self._terminal_weight is None or self._workspace is None:
             self.prepare(first)
