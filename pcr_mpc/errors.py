@@ -67,6 +67,10 @@ class SimulationError(PCRError):
     """A closed-loop run ended early; ``run`` holds everything until then."""
 
 
+class ReadOnlyError(PCRError, AttributeError):
+    """An attribute that cannot be set was: its name is ``attribute``; the message says what to do instead."""
+
+
 class CompilerError(PCRError):
     """No machine code could be made of a graph; ``command`` is what was run."""
 

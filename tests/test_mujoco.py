@@ -1,9 +1,12 @@
 """The robot in MuJoCo, whose code is not ours, moves as the rods of distributed mass do."""
 
+import copy
 import json
+import pickle
 import re
 import shutil
 import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -23,9 +26,10 @@ from pcr_mpc import (
     solve_statics,
 )
 from pcr_mpc.cli import main
+from pcr_mpc.errors import ReadOnlyError
 from pcr_mpc.plant.hinge_chain import settled_chains
 from pcr_mpc.plant.mjcf import coordinates, mjcf
-from pcr_mpc.plant.mujoco_plant import MuJoCoPlant
+from pcr_mpc.plant.mujoco_plant import _WARNINGS, MuJoCoPlant
 
 from .conftest import CONTROLLERS, MODELS
 from .test_distributed import distance, released
@@ -328,3 +332,37 @@ def test_endless_links_are_the_distributed_rods_that_sag(heavy, sagging):
     ]
     assert errors[0] < 0.01 < errors[1] < 0.06
     assert errors[2] > 20.0
+
+
+def test_a_warning_belongs_to_the_plant_whose_thread_steps(pair, centre, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    failing, x = MuJoCoPlant(pair, links=10), state(centre)
+    failing.reset(x, centre)
+
+    def fail():
+        with pytest.raises(ConvergenceError, match="MuJoCo gave up"):
+            failing.step(x, (2.0, 1.0), (1e15, 0.0))
+
+    with _WARNINGS.heard(mujoco) as mine:
+        thread = threading.Thread(target=fail)
+        thread.start()
+        thread.join()
+        assert mine == []
+        assert mujoco.get_mju_user_warning() is not None  # the step that ended did not stop this one's listening
+    assert mujoco.get_mju_user_warning() is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_settings_are_read_only_and_copies_start_afresh(pair, centre):
+    plant, x = MuJoCoPlant(pair, links=10, substeps=3), state(centre)
+    for name in ("dt", "robot", "links", "substeps", "extrapolated", "payload", "method"):
+        with pytest.raises(ReadOnlyError, match=f"MuJoCoPlant.{name} "):
+            setattr(plant, name, getattr(plant, name))
+    plant.reset(x, centre)
+    plant.carry(0.01, x)
+    expected = MuJoCoPlant(pair, links=10, substeps=3)
+    expected.reset(x, centre)
+    expected = rollout(expected, x, 0.01, (2.0, 1.0))
+    for other in (pickle.loads(pickle.dumps(plant)), copy.deepcopy(plant)):
+        other.reset(x, centre)
+        assert rollout(other, x, 0.01, (2.0, 1.0)) == pytest.approx(expected, abs=0)

@@ -279,3 +279,12 @@ def test_unknowns_are_followed_along_the_branch_alone(pair, centre):
         along(np.array([[0.0, 1.0]]), centre.q[None])
     with pytest.raises(ValueError, match="for each of 2 rods"):
         symbolic_dynamics(pair, (1.0,))
+
+
+def test_a_solution_that_leads_nowhere_does_not_spoil_the_next(tuning, target, centre, model, reference, pair, wide):
+    mpc, fresh = (make_nonlinear_mpc(pair, centre, tuning, wide) for _ in range(2))
+    mpc.solve(far(target), model, reference, np.zeros(2))
+    mpc._point = replace(mpc._point, unknowns=np.full_like(mpc._point.unknowns, 1e6))
+    plan = mpc.solve(far(target), model, reference, np.zeros(2))
+    assert plan.status == "solved"
+    np.testing.assert_allclose(plan.inputs, fresh.solve(far(target), model, reference, np.zeros(2)).inputs, atol=1e-5)

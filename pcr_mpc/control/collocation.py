@@ -8,12 +8,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..frozen import freeze
+from ..buffered import building
+from ..frozen import Frozen
 from .tuning import Limits, Tuning
 
 
 @dataclass(frozen=True, eq=False)
-class Transcription:
+class Transcription(Frozen):
     """NLP of one horizon; it is the same for every control step, but for its parameters.
 
     The unknowns are, period after period, one row of [u (n), (acceleration (2), z (2n)) at each Gauss point, state
@@ -43,9 +44,6 @@ class Transcription:
     g_upper: np.ndarray
     nodes: np.ndarray
 
-    def __post_init__(self) -> None:
-        freeze(self)
-
 
 def gauss_tableau(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Runge-Kutta coefficients A (s, s), b (s,), c (s,) of Gauss collocation, of order 2s."""
@@ -55,6 +53,7 @@ def gauss_tableau(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (c[:, None] ** powers / powers) @ from_values, (1.0 / powers) @ from_values, c
 
 
+@building
 def transcribe(dynamics: Any, tuning: Tuning, limits: Limits, dt: float, points: int) -> Transcription:
     """Write the MPC problem of `build_qp` for nonlinear dynamics.
 

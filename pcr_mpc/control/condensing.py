@@ -7,10 +7,11 @@ blocks, where the sum over all periods of every block would take a horizon times
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
+
+from ..buffered import graph_cache
 
 # Graphs up to this many periods become one list of instructions; longer ones stay matrices, which take no time to build.
 _UNROLLED = 12
@@ -34,7 +35,7 @@ class _Models:
             self.a, self.b, self.c = self.a * horizon, self.b * horizon, self.c * horizon
 
 
-@lru_cache(maxsize=32)
+@graph_cache(maxsize=32)
 def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool) -> Any:
     """Graph of the QP data of `build_qp`.
 
@@ -106,7 +107,7 @@ def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool
     return graph.expand("condense", {"cse": True}) if horizon <= _UNROLLED else graph
 
 
-@lru_cache(maxsize=32)
+@graph_cache(maxsize=32)
 def checking(horizon: int, n: int, models: int) -> Any:
     """Graph of what a solution of the QP leads to, and of how good it is.
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 
+from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .mpc import lqr_rates, riccati
@@ -38,20 +39,35 @@ class Law(Protocol):
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """Motor rates where there is no model or no measurement."""
 
+    def retune(self, tuning: Tuning) -> None:
+        """Let another tuning of the same law take effect."""
 
+
+@set_once("call retune, which lets all of it take effect", "tuning")
 class _OneStep(ABC):
     """Rates for one period, clipped to the motors' limits; what poses are to keep is ignored."""
 
     def __init__(self, tuning: Tuning, limits: Limits) -> None:
         self.tuning = tuning
         self.limits = limits
+        self._model: LinearModel | None = None
 
     def reset(self) -> None:  # noqa: B027  it remembers nothing
         """See `Law`."""
 
     def prepare(self, model: LinearModel, combinations: Sequence[tuple[str, ...]] = ()) -> None:
         """See `Law`."""
-        self._dt = model.dt
+        self._dt, self._model = model.dt, model
+
+    def retune(self, tuning: Tuning) -> None:
+        """See `Law`."""
+        self.__dict__["tuning"] = tuning
+        if self._model is not None:
+            self.prepare(self._model)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle and copy as what it was made of; the copy starts afresh."""
+        return type(self), (self.tuning, self.limits)
 
     @abstractmethod
     def _rates(self, x: np.ndarray, reference: Reference) -> np.ndarray:
@@ -120,6 +136,9 @@ class PD(_OneStep):
     ) -> None:
         super().__init__(tuning, limits)
         self._inverse = inverse
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("PD holds a function, and can be neither pickled nor copied: pickle its controller instead")
 
     def _rates(self, x: np.ndarray, reference: Reference) -> np.ndarray:
         proportional, derivative = self.tuning.pd

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import control
 import numpy as np
+from scipy.linalg.blas import dnrm2
 
 from ..errors import InfeasibleError, checked_array, checked_vector
+from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .plan import Plan
@@ -16,7 +20,14 @@ from .qp import Reference, assemble, model_sequence
 from .tuning import Limits, Tuning
 from .workspace import Workspace
 
+_NOT_OF_THE_PROBLEM = ("name", "fallback", "model", "observer", "pd", "period")  # fields of a tuning
+# Between the sizes of one problem and the next: then the last one says nothing about this one.
+_JUMP = 1e3
+_POSES = 30.0  # at most between entries of linear models of one robot
+_SLIGHT = 1e-6  # of the greatest rates: a gradient that asks for less is rounding
 
+
+@set_once("call retune, which lets all of it take effect", "tuning")
 class LinearMPC:
     """Tracks a reference with a linear model, hard limits on the motors and soft ones on the pose.
 
@@ -25,10 +36,15 @@ class LinearMPC:
     moved on by one period, as long as it lasts; else the LQR of the terminal weight, clipped to the limits; else the
     motors brought to rest. (With ``fallback = "raise"`` in the tuning only the first two count.)
 
+    It starts from the last solution where the problem is of the same kind. Where the sizes of the two differ by orders
+    of magnitude, or the limits are others, it starts afresh, so that one absurd problem does not spoil the next.
+
     Parameters
     ----------
     tuning : Tuning
+        See `retune`.
     limits : Limits
+        May be replaced by others at any time.
     """
 
     def __init__(self, tuning: Tuning, limits: Limits) -> None:
@@ -39,11 +55,18 @@ class LinearMPC:
         self._gain: np.ndarray | None = None
         self._last: Plan | None = None
         self._age = 0  # periods since the last plan was solved
+        self._prepared: tuple[LinearModel, Sequence[tuple[str, ...]]] | None = None
+        self._first: LinearModel | None = None  # whose terminal weight it is, if nobody called prepare
+        self._problem: tuple[Limits, float, float] | None = None  # limits and sizes of the last problem
 
     def reset(self) -> None:
         """Start afresh: the same calls then give the same plans, bit for bit."""
-        self._last, self._age = None, 0
-        self._terminal_weight = None
+        self._terminal_weight = self._first = self._prepared = None
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget the last plan and its problem."""
+        self._last, self._age, self._problem = None, 0, None
         if self._workspace is not None:
             self._workspace.reset()
 
@@ -53,11 +76,34 @@ class LinearMPC:
         ``combinations`` are the kinds that the `LinearLimits` to come may have.
         """
         self._gain, self._terminal_weight = riccati(model, self.tuning)
-        self._dt = model.dt
+        self._dt, self._first = model.dt, None
+        self._prepared = model, combinations
         if self._workspace is None:
             self._workspace = Workspace(self.tuning, model)
         for kinds in ((), *combinations):
             self._workspace.limited(kinds)
+
+    def retune(self, tuning: Tuning) -> None:
+        """Let another tuning take effect, all of it, between two steps.
+
+        The next plan is that of a new controller, prepared as this one was; the rates of the last one remain, for a
+        fall-back. It may take a second where there are graphs to build.
+        """
+        others = {name: getattr(self.tuning, name) for name in _NOT_OF_THE_PROBLEM}
+        if replace(tuning, **others) == self.tuning:
+            self.__dict__["tuning"] = tuning
+            return
+        new = LinearMPC(tuning, self.limits)
+        if self._prepared is not None:
+            new.prepare(*self._prepared)
+            new._first = self._first
+        if self._last is not None:
+            new._last, new._age = self._last.spanning(tuning.horizon), self._age
+        self.__dict__.update(new.__dict__)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle and copy as what it was made of; the copy starts afresh."""
+        return type(self), (self.tuning, self.limits)
 
     def solve(
         self,
@@ -97,14 +143,21 @@ class LinearMPC:
         horizon = self.tuning.horizon
         wanted = checked_array("reference.states", reference.states, (horizon, n_states))
         feed_forward = checked_array("reference.inputs", reference.inputs, (horizon, n))
+        if self._first is not None and first is not self._first and _another_robot(self._first, first):
+            self.reset()
         if self._terminal_weight is None or self._workspace is None:
             self.prepare(first)
+            self._first = first
         assert self._terminal_weight is not None
         assert self._workspace is not None
         self._workspace.require(sequence)
         window = Reference(wanted, feed_forward)
         qp = assemble(x, sequence, window, u_previous, self.tuning, self.limits, self._terminal_weight)
-        warm = None if self._last is None else _shifted(self._last.inputs).ravel()
+        problem = self.limits, float(dnrm2(qp.P)), float(dnrm2(qp.q))
+        if not self._continues(*problem):
+            self._forget()
+        warm = None if self._last is None or self._problem is None else _shifted(self._last.inputs).ravel()
+        self._problem = problem
         updated = time.perf_counter()
         status, fallback = "solved", None
         try:
@@ -145,6 +198,18 @@ class LinearMPC:
             solver_time=answer.solution.run_time,
         )
         return self._last
+
+    def _continues(self, limits: Limits, hessian: float, gradient: float) -> bool:
+        """Whether the last solution is a start for a problem of these sizes; NaN continues nothing."""
+        if self._problem is None:
+            return True
+        before, last_hessian, last_gradient = self._problem
+        slight = _SLIGHT * hessian * (limits.rate if limits.rate < np.inf else 1.0)
+        return (
+            limits is before
+            and hessian <= _JUMP * last_hessian <= _JUMP**2 * hessian
+            and last_gradient <= _JUMP * max(gradient, slight)
+        )
 
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """Answer without a QP: because it was not solved, or because there is no model or no measurement.
@@ -205,6 +270,12 @@ def lqr_rates(gain: np.ndarray, x: np.ndarray, reference: Reference, dt: float) 
     wanted[:2] -= dt * wanted[2:4]
     wanted[4:] -= dt * reference.inputs[0]
     return np.asarray(reference.inputs[0] - gain @ (x - wanted))
+
+
+def _another_robot(one: LinearModel, other: LinearModel) -> bool:
+    """Whether two models differ by more than poses of one robot do."""
+    sizes = ((float(np.abs(m.A[:4, :4]).max()), float(np.abs(m.B[:4]).max())) for m in (one, other))
+    return any(not a / _POSES <= b <= a * _POSES for a, b in zip(*sizes, strict=True))
 
 
 def _shifted(inputs: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..buffered import BUILDING
 from ..errors import InfeasibleError
 from .collocation import Transcription
 
@@ -93,7 +94,8 @@ class NLPSolver:
         ipopt = {**_IPOPT, "max_iter": max_iterations}
         # A trial step to where the model is NaN is cut short by IPOPT itself.
         options: dict[str, Any] = {"ipopt": ipopt, "print_time": False, "show_eval_warnings": False}
-        self._solver = ca.nlpsol("nonlinear_mpc", "ipopt", nlp.problem, options)
+        with BUILDING:
+            self._solver = ca.nlpsol("nonlinear_mpc", "ipopt", nlp.problem, options)
 
     def solve(self, parameters: np.ndarray, start: Point) -> NLPSolution:
         """Solve from a start.

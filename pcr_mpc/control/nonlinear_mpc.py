@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from ..errors import InfeasibleError, PCRError, checked_array, checked_vector
+from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .collocation import Transcription, transcribe
@@ -23,6 +24,9 @@ from .tuning import Limits, Tuning
 _ACTIVE = 1e-4
 
 
+@set_once(
+    "call retune, which lets all of it take effect", "tuning", limits="make a new one: they are part of its problem"
+)
 class NonlinearMPC:
     """Tracks a reference with the exact nonlinear model and hard limits on the motors.
 
@@ -73,10 +77,26 @@ class NonlinearMPC:
         self._age = 0  # periods since the last plan was solved
         self._point: Point | None = None
         self._terminal_weight = None
+        self._prepared: LinearModel | None = None
+
+    def retune(self, tuning: Tuning) -> None:
+        """Let another tuning take effect, all of it, between two steps; the last rates remain, for a fall-back."""
+        new = NonlinearMPC(tuning, self.limits, self._dynamics, self._algebraic, points=self._points,
+                           max_iterations=self._max_iterations)  # fmt: skip
+        if self._prepared is not None:
+            new.prepare(self._prepared)
+        if self._last is not None:
+            new._last, new._age = self._last.spanning(tuning.horizon), self._age
+        self.__dict__.update(new.__dict__)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "NonlinearMPC holds a function, and can be neither pickled nor copied: pickle its controller instead"
+        )
 
     def prepare(self, model: LinearModel, combinations: Sequence[tuple[str, ...]] = ()) -> None:
         """Take the terminal weight from ``model`` and build the NLP; else the first `solve` does it."""
-        self._terminal_weight = terminal_weight(model, self.tuning)
+        self._terminal_weight, self._prepared = terminal_weight(model, self.tuning), model
         if self._nlp is None:
             self._dt = model.dt
             self._nlp = transcribe(self._dynamics, self.tuning, self.limits, model.dt, self._points)
@@ -136,14 +156,17 @@ class NonlinearMPC:
         parameters = np.concatenate([x, force, u_previous, wanted.ravel(), feed_forward.ravel(), weight])
         updated = began
         try:
-            start = self._start(x, reference) if self._point is None else self._point.shifted()
-            updated = time.perf_counter()
-            solution = self._solver.solve(parameters, start)
+            solution = self._continued(parameters)
+            if solution is None:
+                start = self._start(x, reference)
+                updated = time.perf_counter()
+                solution = self._solver.solve(parameters, start)
         except PCRError as error:
             self._point = None
             if self.tuning.fallback == "raise":
                 raise
-            status = error.status if isinstance(error, InfeasibleError) else f"no start: {error}"
+            first = error if self._refused is None else self._refused
+            status = first.status if isinstance(first, InfeasibleError) else f"no start: {first}"
             return self.fall_back(status, x, reference, u_previous)
         self._point, self._age = solution.point, 0
         rows = solution.point.unknowns
@@ -152,6 +175,16 @@ class NonlinearMPC:
         agreeing = replace(model, c=model.c + predicted[1] - model(x, inputs[0]))
         times = updated - began, time.perf_counter() - updated
         return self._remember(inputs, predicted, agreeing, "solved", None, solution, times)
+
+    def _continued(self, parameters: np.ndarray) -> NLPSolution | None:
+        """Solve from the last solution; None where it leads nowhere, for it must not spoil this one."""
+        self._refused: InfeasibleError | None = None
+        if self._point is not None:
+            try:
+                return self._solver.solve(parameters, self._point.shifted())
+            except InfeasibleError as error:
+                self._refused = error
+        return None
 
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """Answer without a solution: because there is none, or no model or no measurement.

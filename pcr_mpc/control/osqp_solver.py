@@ -194,7 +194,7 @@ class QPSolver:
                 limit = int(np.argmax(np.abs(core.solution.prim_inf_cert)))
             # An unsolved problem's iterate and step size must not start the next one.
             self._require(self._osqp.warm_start(np.zeros(self.n), np.zeros(self.m)), "warm_start")
-            self._osqp.update_settings(rho=_RHO)
+            self._osqp.update_settings(rho=self._settings["rho"])
             raise InfeasibleError(
                 f"the QP was not solved: {status} after {iterations} iterations; "
                 "relax the limits, shorten the horizon or raise max_iterations",

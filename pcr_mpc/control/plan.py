@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..frozen import Frozen
 from ..linearisation.linear_model import LinearModel
 
 # From the best answer to the last resort.
@@ -14,7 +15,7 @@ RUNGS = ("softened", "shifted_plan", "lqr", "hold")
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(Frozen):
     """Result of one control step: the motor rates, and the certificate that goes with them.
 
     Attributes
@@ -55,7 +56,7 @@ class Plan:
     solve_time: float = 0.0
     solver_time: float = 0.0
 
-    def __post_init__(self) -> None:
-        self.inputs.flags.writeable = False
-        if self.states is not None:
-            self.states.flags.writeable = False
+    def spanning(self, horizon: int) -> Plan:
+        """Return its rates over another horizon, the last ones held beyond its end; nothing else of it."""
+        rows = np.minimum(np.arange(horizon), len(self.inputs) - 1)
+        return Plan(self.inputs[rows], None, None, self.status, self.fallback)

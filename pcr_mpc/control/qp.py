@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -12,7 +11,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache, per_thread
 from ..errors import checked_array, checked_vector
 from ..frozen import read_only
 from ..linearisation.linear_model import LinearModel
@@ -112,9 +111,7 @@ def assemble(
     """`build_qp` for arguments that are known to be right; one model or N of them."""
     n_states, n = models[0].B.shape
     single = len(models) == 1
-    function = _condensing(
-        tuning.horizon, n, single, tuning.velocity_weight > 0, tuning.angle_weight > 0, threading.get_ident()
-    )
+    function = _condensing(tuning.horizon, n, single, tuning.velocity_weight > 0, tuning.angle_weight > 0)
     a, b, c, start, states, inputs, previous, weights, terminal, bounds, dt = function.inputs
     for k, model in enumerate(models):
         a[:, k * n_states : (k + 1) * n_states] = model.A
@@ -148,7 +145,7 @@ class Rollout:
 
     def __init__(self, horizon: int, n: int) -> None:
         self._n_states, self._n = 4 + n, n
-        self._functions = {single: _rollout(horizon, n, single, threading.get_ident()) for single in (True, False)}
+        self._functions = {single: BufferedFunction(_rollout(horizon, n, single)) for single in (True, False)}
 
     def __call__(self, x: np.ndarray, models: Sequence[LinearModel], inputs: np.ndarray) -> np.ndarray:
         """States at the ends of the periods, x first, shape (N + 1, 4 + n); one model or N of them."""
@@ -164,8 +161,8 @@ class Rollout:
         return function.outputs[0].reshape((self._n_states, -1), order="F").T.copy()
 
 
-@lru_cache(maxsize=32)
-def _rollout(horizon: int, n: int, single: bool, thread: int) -> BufferedFunction:
+@graph_cache(maxsize=32)
+def _rollout(horizon: int, n: int, single: bool) -> Any:
     n_states, count = 4 + n, 1 if single else horizon
     a, b = ca.SX.sym("A", n_states, count * n_states), ca.SX.sym("B", n_states, count * n)
     c, x, u = ca.SX.sym("c", count * n_states), ca.SX.sym("x", n_states), ca.SX.sym("u", horizon * n)
@@ -174,7 +171,7 @@ def _rollout(horizon: int, n: int, single: bool, thread: int) -> BufferedFunctio
         i = 0 if single else k
         rows, columns = slice(i * n_states, (i + 1) * n_states), slice(i * n, (i + 1) * n)
         states.append(a[:, rows] @ states[-1] + b[:, columns] @ u[k * n : (k + 1) * n] + c[rows])
-    return BufferedFunction(ca.Function("rollout", [a, b, c, x, u], [ca.vertcat(*states)]))
+    return ca.Function("rollout", [a, b, c, x, u], [ca.vertcat(*states)])
 
 
 @lru_cache(maxsize=16)
@@ -203,8 +200,13 @@ def model_sequence(models: LinearModel | Sequence[LinearModel], horizon: int) ->
     return sequence
 
 
-@lru_cache(maxsize=32)
-def _condensing(horizon: int, n: int, single: bool, velocity: bool, angle: bool, thread: int) -> BufferedFunction:
+@per_thread(maxsize=32)
+def _condensing(horizon: int, n: int, single: bool, velocity: bool, angle: bool) -> BufferedFunction:
+    return BufferedFunction(_condensing_graph(horizon, n, single, velocity, angle))
+
+
+@graph_cache(maxsize=32)
+def _condensing_graph(horizon: int, n: int, single: bool, velocity: bool, angle: bool) -> Any:
     """Linear models, state and reference to (P, q, l, u) in one graph."""
     n_states = 4 + n
     count = 1 if single else horizon
@@ -289,10 +291,9 @@ def _condensing(horizon: int, n: int, single: bool, velocity: bool, angle: bool,
         first + ca.repmat(change, horizon, 1),
         ca.repmat((upper - x[4:]) / dt, horizon, 1),
     ]
-    function = ca.Function(
+    return ca.Function(
         "condense",
         [a_all, b_all, c_all, x, states, inputs, previous, weights, terminal, bounds, dt],
         [upper_triangle, gradient, ca.vertcat(*l_all), ca.vertcat(*u_all)],
         {"cse": True},
     )
-    return BufferedFunction(function)

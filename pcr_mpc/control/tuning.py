@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import checked_number
+from ..frozen import Frozen
 from ..toml_table import read_toml
 from .observer import ObserverTuning
 
@@ -106,7 +107,7 @@ class Tuning:
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class Limits(Frozen):
     """Hard limits on the motors.
 
     Attributes
@@ -131,6 +132,9 @@ class Limits:
         lower, upper = np.asarray(self.angle_lower), np.asarray(self.angle_upper)
         if lower.ndim != 1 or lower.shape != upper.shape or not (lower <= upper).all():
             raise ValueError(f"angle_lower = {lower} and angle_upper = {upper} must be vectors, lower <= upper")
+        for name, angles in (("angle_lower", lower), ("angle_upper", upper)):
+            object.__setattr__(self, name, angles.astype(float))  # a copy, the limits' own
+        super().__post_init__()
 
     def clipped(self, u: np.ndarray, u_previous: np.ndarray) -> np.ndarray:
         """Rates nearest to u that meet the limits on rate and change exactly; OSQP meets them to its tolerance."""

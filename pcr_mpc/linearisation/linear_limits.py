@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..frozen import freeze
+from ..frozen import Frozen
 
 KINDS = ("torque", "tip region", "rod margin", "stiffness")
 
 
 @dataclass(frozen=True, eq=False)
-class LinearLimits:
+class LinearLimits(Frozen):
     """Limits on what a pose means, about one state, as far as they are near; each row is normalised.
 
     Attributes
@@ -31,6 +31,3 @@ class LinearLimits:
     lower: np.ndarray
     upper: np.ndarray
     scale: np.ndarray
-
-    def __post_init__(self) -> None:
-        freeze(self)

@@ -8,11 +8,11 @@ from typing import Any
 import control
 import numpy as np
 
-from ..frozen import freeze
+from ..frozen import Frozen
 
 
 @dataclass(frozen=True, eq=False)
-class LinearModel:
+class LinearModel(Frozen):
     """Affine discrete-time model x+ = A x + B u + c with x = [p, v, q] and u held over dt.
 
     The external force that it was made for is in c; a further force f adds E f.
@@ -36,9 +36,6 @@ class LinearModel:
     E: np.ndarray
     dt: float
     force: np.ndarray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Predict the next state."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import threading
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache, per_thread
 from ..errors import checked_number, checked_vector
 from ..plant.dynamics import DERIVATIVE_ACCURACY, Plant
 from .linear_model import LinearModel
@@ -66,7 +64,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
             f"and (c dt/m)^2 is {damping * damping:.3g}, at most {STIFFEST:g}; shorten the period or keep away from "
             "taut rods"
         )
-    function = _buffered(plant.robot.n_rods, threading.get_ident())
+    function = _buffered(plant.robot.n_rods)
     function.inputs[0][:] = k
     function.inputs[1][:] = g
     function.inputs[2][:] = force - f_ext - plant.tip_weight
@@ -83,12 +81,12 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     return LinearModel(a, b, c, e, dt, f_ext.copy())
 
 
-@lru_cache(maxsize=32)
-def _buffered(n: int, thread: int) -> BufferedFunction:
+@per_thread(maxsize=32)
+def _buffered(n: int) -> BufferedFunction:
     return BufferedFunction(discretisation(n))
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=32)
 def discretisation(n: int) -> Any:
     """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q)) -> [A, c, B, E],
     column by column in one vector."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 
+from ..buffered import graph_cache
 from ..plant.mass_matrix import mass_calls
 from ..plant.rod_method import warm_calls
 from ..plant.step_graph import StepModel
@@ -41,7 +41,7 @@ def sizes(model: StepModel) -> Sizes:
     return Sizes((4 * width + 3) * n, (4 * width + 20) * n, n_states * (n_states + 1 + n + 2))
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def force_graph(model: StepModel, iterations: int) -> Any:
     """The rods' force and its derivatives with everything that weighs on it.
 
@@ -66,7 +66,7 @@ def force_graph(model: StepModel, iterations: int) -> Any:
     return ca.Function("force", [target, memory, vector], [record, verdict, force, k, g])
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def model_graph(model: StepModel, iterations: int) -> Any:
     """Linear model about a state, the rods following from a memory; nothing is decided in here.
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..buffered import BufferedFunction
+from ..frozen import Remade, set_once
 from ..plant import elastica
 from ..plant.chart import LEAST_CRITICAL_LOAD, critical_load, critical_load_slope, rough_critical_load
 from ..plant.dynamics import Plant
@@ -47,7 +48,8 @@ class PoseLimits:
     stiffness: float | None = None
 
 
-class LimitWatch:
+@set_once("make a new LimitWatch with them", "limits")
+class LimitWatch(Remade):
     """Linearises the limits of a pose where they come near, by implicit differentiation of the exact rods.
 
     Parameters
@@ -65,7 +67,6 @@ class LimitWatch:
     """
 
     def __init__(self, limits: PoseLimits, plant: Plant) -> None:
-        self.limits = limits
         self._robot = robot = plant.robot
         if plant.method == "closed_form":
             self._plant, plain = plant, True
@@ -73,7 +74,8 @@ class LimitWatch:
             plain = plant.weight != "exact" and robot.weightless().needs_shooting is None
             self._plant = Plant(robot, weight="none") if plain else plant
         if not plain:
-            limits = self.limits = replace(limits, rod_margin=None, stiffness=None)
+            limits = replace(limits, rod_margin=None, stiffness=None)
+        self.limits = limits
         given = (limits.torque, limits.tip_lower, limits.rod_margin, limits.stiffness)
         self._present = tuple(kind for kind, limit in zip(KINDS, given, strict=True) if limit is not None)
         n = robot.n_rods

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..frozen import Remade
 from ..linearisation.linear_model import LinearModel
 from ..linearisation.linearise import linearise
 from ..plant.dynamics import Plant
@@ -23,7 +24,7 @@ class _Spot:
     model: LinearModel | None = None
 
 
-class AlongPlan:
+class AlongPlan(Remade):
     """One model for each period of the plan but the first.
 
     In the next control period a spot is needed where its neighbour is now, so the models move on with time, and are

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..control.plan import Plan
+from ..frozen import read_only
 from ..plant.equilibrium import Equilibrium
 
 
@@ -54,7 +55,7 @@ class Replay:
     name = "replay"
 
     def __init__(self, u: np.ndarray) -> None:
-        self._u = u
+        self._u = read_only(np.array(u, dtype=float))
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`."""
@@ -70,7 +71,7 @@ class HoldMotors:
     name = "none"
 
     def __init__(self, n_rods: int) -> None:
-        self._u = np.zeros(n_rods)
+        self._u = read_only(np.zeros(n_rods))
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`."""

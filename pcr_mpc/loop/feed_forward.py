@@ -8,6 +8,7 @@ import numpy as np
 
 from ..control.qp import Reference
 from ..errors import ConvergenceError, PCRError
+from ..frozen import Frozen
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import inverse_statics
@@ -21,7 +22,7 @@ _MOST_SWEEPS = 20
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class InverseDynamics(Reference):
+class InverseDynamics(Frozen, Reference):
     """What the reference asks of the motors at K times from the start on.
 
     Attributes

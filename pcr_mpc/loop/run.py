@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import PCRError
-from ..frozen import freeze
+from ..frozen import Frozen
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from .finding import verified
@@ -28,7 +28,7 @@ _ANGLE_SLACK = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(Frozen):
     """Everything that happened, at the plant's steps (K + 1 times) and at control periods (M).
 
     Attributes
@@ -87,9 +87,6 @@ class Run:
     rungs: dict[str, int]
     events: list[dict[str, Any]] = field(default_factory=list)
     rung: PlantSettings | None = None
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def steps_per_period(self) -> int:

@@ -8,6 +8,7 @@ from operator import mul
 import numpy as np
 
 from ..errors import PCRError
+from ..frozen import Remade
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.robot import Robot
@@ -21,7 +22,7 @@ _FOLLOW = 10
 _SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
 
 
-class MotorTarget:
+class MotorTarget(Remade):
     """Shift of the motor angles at which the model's rods carry a given force and the tip's weight, by Newton's method.
 
     One iteration a call: the tip and the force change little from one control period to the next, and where they do not

@@ -17,6 +17,7 @@ from ..control.plan import Plan
 from ..control.qp import Reference
 from ..control.tuning import Limits, Tuning
 from ..errors import PCRError
+from ..frozen import Remade, set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from ..linearisation.linearise import linearise
@@ -32,14 +33,18 @@ from .scene import Scene
 from .target import MotorTarget
 
 
-class TrackingController:
+@set_once("make a new controller with it", "robot", tuning="call retune, which lets all of it take effect")
+class TrackingController(Remade):
     """A control law behind an observer, a prediction of delays and a target that carries the unknown force.
+
+    A pickled or copied one is made of the same, and begins with `start`.
 
     Parameters
     ----------
     scene : Scene
         Reference, period, delay, sensors and limits; not its loads.
     tuning : Tuning
+        See `retune`.
     robot : Robot, optional
         What the controller believes the robot to be; by default the scene's.
     reference : InverseDynamics, optional
@@ -52,22 +57,19 @@ class TrackingController:
     ) -> None:
         if scene.trajectory is None:
             raise ValueError(f"scene {scene.name} has no reference to track")
-        self.name = tuning.name
+        self.tuning: Tuning
         self.robot = robot or scene.robot
         self.observer: DisturbanceObserver | None = None
-        # A payload that the model does not know is one that the scene does not have.
-        self._scene, self._tuning = scene if tuning.model.payload else replace(scene, payload=None), tuning
-        self._delay = scene.delay if tuning.model.predict_delay else 0
-        self._known = reference
+        self._told, self._known = scene, reference
+        self._take(tuning)
         needed = scene.n_periods + tuning.horizon + self._delay
         if reference is not None and len(reference.inputs) < needed:
             raise ValueError(f"reference has {len(reference.inputs)} periods; scene and horizon need {needed}")
         self._model = self._make_model()
-        self._along: AlongPlan | None = None
-        if tuning.model.linearise == "along_plan":
-            self._along = AlongPlan([self._make_model() for _ in range(tuning.horizon - 1)], scene.period)
+        self._along = self._make_along()
         self._watch = LimitWatch(scene.pose_limits, self._model)
         self._target = MotorTarget(self.robot)
+        self._sent: deque[np.ndarray] = deque(maxlen=scene.delay)
         self._on_the_way: deque[np.ndarray] = deque()
         self._u = np.zeros(self.robot.n_rods)
         self._plan: Plan | None = None
@@ -76,15 +78,12 @@ class TrackingController:
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
-        tail, inertia = self._tuning.horizon + self._delay, self._tuning.model.inertia
-        self._reference = self._known or feed_forward(self._scene, self.robot, pose, tail, inertia)
-        self._payloads = self._scene.carried(self._scene.period * np.arange(self._scene.n_periods + tail))
+        self._pose = pose
+        self._invert_dynamics(self._known)
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         if self._law is None:
             self._law = self._make_law(pose)
-        model = self._make_model()
-        model.reset(x, pose)
-        resting = linearise(model, x, np.zeros(self.robot.n_rods), self._scene.period)
+        resting = self._rest()
         # One throw-away step pays for building graphs and workspaces before the clock runs.
         self._restart(x, pose, resting)
         self.step(0, x)
@@ -95,19 +94,87 @@ class TrackingController:
         assert self._law is not None
         self._law.reset()
         self._law.prepare(resting, self._watch.combinations())
-        if self._tuning.observer is not None:
-            sensors = self._scene.tip_noise, self._scene.angle_step
-            self.observer = DisturbanceObserver(self._tuning.observer, *sensors, resting)
+        self.observer = self._make_observer(resting)
+        if self.observer is not None:
             self.observer.start(x)
         for part in (self._model, self._watch, self._along):
             if part is not None:
                 part.reset(x, pose)
         self._target.start(pose)
         self._inverse.start(pose)
-        self._predicts = resting
+        self._predicts, self._seen = resting, (x, np.zeros(self.robot.n_rods))
+        self._sent.extend([np.zeros(self.robot.n_rods)] * self._told.delay)
         self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
         self._u = np.zeros(self.robot.n_rods)
         self._plan = None
+
+    def retune(self, tuning: Tuning) -> None:
+        """Let another tuning take effect, all of it, between two steps.
+
+        Estimates, commands on the way, the branch of the rods and the last rates are kept. What the new tuning needs is
+        made here, which may take a second; where it does not work out, the controller is as it was.
+
+        Raises
+        ------
+        ValueError
+            The tuning is for another control period, or for a law that does not fit the scene.
+        PCRError
+            The new model does not reach the reference or the pose where the robot is now.
+        """
+        period = self._told.period
+        if tuning.period is not None and abs(tuning.period - period) > 1e-9 * period:
+            raise ValueError(
+                f"{tuning.name} is for a control period of {tuning.period} s, the controller runs at {period} s; "
+                "make a new one for scene.tuned(tuning)"
+            )
+        before = self.__dict__.copy()
+        try:
+            self._retune(tuning)
+        except BaseException:
+            self.__dict__.clear()
+            self.__dict__.update(before)
+            raise
+        self._now_made_of(tuning=tuning, reference=None)
+
+    def _retune(self, tuning: Tuning) -> None:
+        old, scene = self.tuning, self._scene
+        self._take(tuning)
+        self._known = None
+        model_changed = tuning.model != old.model
+        started = self._law is not None
+        here = self._expected() if started else np.zeros(0)
+        if model_changed:
+            pose = self._model.equilibrium(here) if started else None
+            self._model = self._make_model()
+            self._watch = LimitWatch(self._told.pose_limits, self._model)
+            if pose is not None:
+                self._model.reset(here, pose)
+                self._watch.reset(here, pose)
+        if model_changed or tuning.horizon != old.horizon:
+            self._along = self._make_along()
+            if self._along is not None and started:
+                self._along.reset(here, self._model.equilibrium(here))
+        if not started:
+            return
+        needed = self._scene.n_periods + tuning.horizon + self._delay
+        same_dynamics = (tuning.model.inertia, self._scene) == (old.model.inertia, scene)
+        if not same_dynamics or len(self._reference.inputs) < needed:
+            self._invert_dynamics(None)
+        resting = self._rest() if model_changed else self._resting
+        if model_changed or tuning.observer != old.observer:
+            observer, self.observer = self.observer, self._make_observer(resting)
+            if self.observer is not None:
+                self.observer.start(here)
+                if observer is not None:
+                    self.observer.force = observer.force.copy()
+        if self._delay != len(self._on_the_way):
+            self._on_the_way = deque(list(self._sent)[len(self._sent) - self._delay :])
+        assert self._law is not None
+        if tuning.law == old.law and not model_changed:
+            self._law.retune(tuning)
+        else:
+            self._law = self._make_law(self._pose)
+            self._law.prepare(resting, self._watch.combinations())
 
     def step(self, k: int, x: np.ndarray) -> Decision:
         """See `Controller`; a measurement that is not finite is bridged by the prediction."""
@@ -129,7 +196,7 @@ class TrackingController:
             models = self._linearise(ahead, k, force)
             pose_limits = self._watch.rows(ahead)
         except (PCRError, ValueError) as error:
-            if self._tuning.fallback == "raise":
+            if self.tuning.fallback == "raise":
                 raise
             failure, models = f"no linear model: {error}", None
         linearised = time.perf_counter() - began
@@ -140,6 +207,7 @@ class TrackingController:
         else:
             plan = self._law.solve(ahead, models, window, self._u, pose_limits)
         self._u, self._plan = plan.inputs[0], plan
+        self._sent.append(self._u)
         self._on_the_way.append(self._u)
         arriving = self._on_the_way.popleft()
         if now is not None:
@@ -150,6 +218,7 @@ class TrackingController:
             self._predicts = better if isinstance(better, LinearModel) else better[0]
         if observer is not None:
             observer.predict(self._predicts, arriving)
+        self._seen = x, arriving
         return Decision(plan.inputs[0], plan, linearised)
 
     def _linearise(self, x: np.ndarray, k: int, force: np.ndarray) -> LinearModel | list[LinearModel]:
@@ -157,11 +226,11 @@ class TrackingController:
         if self._along is None:
             return here
         first = k + self._delay + 1
-        # The last plan, one period on; at the start the reference.
-        if self._plan is None or self._plan.states is None:
-            path = self._reference.states[first : first + self._tuning.horizon - 1]
-        else:
-            path = self._plan.states[2:]
+        # The last plan, one period on; at the start, and beyond the end of a shorter plan, the reference.
+        path = self._reference.states[first : first + self.tuning.horizon - 1]
+        if self._plan is not None and self._plan.states is not None:
+            known = self._plan.states[2:]
+            path = known if len(known) == len(path) else np.concatenate([known[: len(path)], path[len(known) :]])
         return [here, *self._along.models(path, self._u, force, self._payloads[first : first + len(path)])]
 
     def _model_at(self, k: int, x: np.ndarray, u: np.ndarray, force: np.ndarray) -> LinearModel:
@@ -173,7 +242,7 @@ class TrackingController:
 
     def _window(self, k: int, force: np.ndarray) -> Reference:
         """Reference over the horizon from period k on, its angles moved to carry the unknown force."""
-        horizon, reference = self._tuning.horizon, self._reference
+        horizon, reference = self.tuning.horizon, self._reference
         states, inputs = reference.states[k + 1 : k + 1 + horizon], reference.inputs[k : k + horizon]
         forces = reference.forces[k + 1 : k + 1 + horizon]
         if self.observer is not None:
@@ -184,15 +253,47 @@ class TrackingController:
             states[:, 4:] += self._target.shift(end[:2], end[4:], forces[-1]) if shift is None else shift
         return Reference(states, inputs, forces)
 
+    def _expected(self) -> np.ndarray:
+        """State that is expected at the next step."""
+        return self._predicts(*self._seen) if self.observer is None else self.observer.x
+
+    def _take(self, tuning: Tuning) -> None:
+        self.__dict__["tuning"], self.name = tuning, tuning.name
+        # A payload that the model does not know is one that the scene does not have.
+        self._scene = self._told if tuning.model.payload else replace(self._told, payload=None)
+        self._delay = self._told.delay if tuning.model.predict_delay else 0
+
+    def _invert_dynamics(self, known: InverseDynamics | None) -> None:
+        tail, inertia = self.tuning.horizon + self._delay, self.tuning.model.inertia
+        self._reference = known or feed_forward(self._scene, self.robot, self._pose, tail, inertia)
+        self._payloads = self._scene.carried(self._scene.period * np.arange(self._scene.n_periods + tail))
+
+    def _rest(self) -> LinearModel:
+        """Linear model about the start."""
+        model, x = self._make_model(), np.concatenate([self._pose.p, np.zeros(2), self._pose.q])
+        model.reset(x, self._pose)
+        self._resting = linearise(model, x, np.zeros(self.robot.n_rods), self._scene.period)
+        return self._resting
+
+    def _make_along(self) -> AlongPlan | None:
+        if self.tuning.model.linearise != "along_plan":
+            return None
+        return AlongPlan([self._make_model() for _ in range(self.tuning.horizon - 1)], self._scene.period)
+
+    def _make_observer(self, resting: LinearModel) -> DisturbanceObserver | None:
+        if self.tuning.observer is None:
+            return None
+        return DisturbanceObserver(self.tuning.observer, self._told.tip_noise, self._told.angle_step, resting)
+
     def _make_model(self) -> Plant:
-        model = self._tuning.model
+        model = self.tuning.model
         return Plant(
             self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
             inertia=model.inertia,
         )  # fmt: skip
 
     def _make_law(self, pose: Equilibrium) -> Law:
-        tuning, limits = self._tuning, motor_limits(self._scene.robot, self._scene.period)
+        tuning, limits = self.tuning, motor_limits(self._scene.robot, self._scene.period)
         if tuning.law == "linear_mpc":
             return LinearMPC(tuning, limits)
         if tuning.law == "nonlinear_mpc":

@@ -12,7 +12,6 @@ the sheet of stable shapes is tabulated once, and a tip position is looked up by
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, per_thread
 from . import elastica
 
 LEAST_CRITICAL_LOAD = 5.7659  # of all rods, at k = 0.9427
@@ -187,7 +186,7 @@ def held_shapes(xi: float, eta: float) -> list[HeldShape]:
 
 def _evaluate_tip(unknowns: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Tip minus target, its Jacobian in (log tip_angle, load), and the energy."""
-    function = _tip_map(threading.get_ident())
+    function = _tip_map()
     function.inputs[0][:] = unknowns
     function()
     tip, jacobian, energy = function.outputs
@@ -198,8 +197,8 @@ def _determinant(log_tip_angle: float, load: float) -> float:
     return float(np.linalg.det(_evaluate_tip(np.array([log_tip_angle, load]), np.zeros(2))[1]))
 
 
-@lru_cache
-def _tip_map(thread: int) -> BufferedFunction:
+@per_thread()
+def _tip_map() -> BufferedFunction:
     return BufferedFunction(elastica.tip_map())
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConvergenceError, PCRError, UnstableError, checked_number, checked_vector
-from ..frozen import read_only
+from ..frozen import Remade, read_only, set_once
 from .equilibrium import Equilibrium
 from .integrators import INTEGRATORS
 from .mass_matrix import CondensedMass, MassMatrix, tip_mass
@@ -27,7 +27,20 @@ from .weight import CondensedWeight
 DERIVATIVE_ACCURACY = 1e-6
 
 
-class Plant:
+@set_once(
+    "make a new Plant with it",
+    "robot",
+    "method",
+    "shooting",
+    "inertia",
+    "weight",
+    "integrator",
+    "dt",
+    "compiled",
+    "n_states",
+    payload="call carry, which keeps the momentum, or reset, which takes it away",
+)
+class Plant(Remade):
     """The robot in motion: m p'' + c p' = -F(p, q) + m g + F_ext, motor angles driven by their rates.
 
     The state is x = [p (2), v (2), q (n)] in [m, m/s, rad], the input u = q' (n) in rad/s.
@@ -69,7 +82,8 @@ class Plant:
     A state does not say on which branch the rods are, so the plant follows them by continuity from one call
     to the next; `reset` starts elsewhere. Motors saturate: rates are clipped to the limit and angles stop at
     theirs. (The limit on the change of rate concerns commands, and is the controller's.) What the tip carries besides
-    its own mass is the plant's ``payload`` [kg], see `carry`.
+    its own mass is the plant's ``payload`` [kg], see `carry`. What the plant was made of can be read and not set. A
+    pickled or copied plant is made of the same, and starts with a `reset`.
 
     A motor's rate jumps from one step to the next, and a rod's mass makes that an impulse on the tip: the momentum
     M_pp p' + M_pq u has no jump, p' has one. The state's v is therefore M_pp^-1 times the momentum: the velocity
@@ -98,11 +112,6 @@ class Plant:
         compiled: bool = False,
     ) -> None:
         method, weight, rods = checked_choices(robot, method, inertia, modes, weight, integrator, dt, on_snap)
-        self._settings: dict[str, Any] = {
-            "method": method, "segments": segments, "steps": steps, "scheme": scheme, "inertia": inertia,
-            "modes": modes, "weight": weight, "integrator": integrator, "dt": dt, "on_snap": on_snap,
-            "compiled": compiled,
-        }  # fmt: skip
         self.robot = robot
         self.method = method
         self.inertia = inertia
@@ -138,7 +147,8 @@ class Plant:
 
     def of(self, robot: Robot) -> Plant:
         """Return a plant that simulates another robot in the same way; errors as `Plant`."""
-        return Plant(robot, **self._settings)
+        _, settings = self.__dict__["_made_of"]
+        return Plant(**{**settings, "robot": robot})
 
     def reset(self, x: Any, guess: Equilibrium | None = None) -> None:
         """Put the rods on the branch of ``guess`` at state x, or on the branch of least energy (None)."""
@@ -196,7 +206,7 @@ class Plant:
         mass, slopes = self._mass
         n = self.robot.n_rods
         self._mass = read_only(mass + np.diag([payload - self.payload] * 2 + [0.0] * n)), slopes
-        self.payload, self._mass_at = payload, None
+        self.__dict__["payload"], self._mass_at = payload, None
         self._tip_weight = self.robot.tip_weight + payload * np.array(self.robot.gravity)
         if self.step_model is not None:
             kind = self.step_model.kind
@@ -292,10 +302,13 @@ class Plant:
 
     def _step_quickly(self, x: np.ndarray, u: np.ndarray, f_ext: np.ndarray) -> np.ndarray | None:
         """Step in one call, or None where that is not possible."""
-        if self._quick is None:
-            if self.step_model is None:
-                return None
+        if self.step_model is None:
+            return None
+        if self._quick is None or self._quick.model is not self.step_model:
             assert isinstance(self._solver, RodSolver)
+            if self._quick is not None:
+                self._quick.hand_over()
+                self._quick_at = None
             self._quick = QuickStep(self.step_model, self._solver, self.numbers, compiled=self.compiled)
         at = x.tolist()
         del at[2:4]

@@ -13,12 +13,12 @@ iteration per rod. The logarithm is the variable because a taut rod has tip_angl
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..buffered import graph_cache
 from .rod import sample_rod
 
 # Ascending Landen steps: k' falls below 1e-16 from any k >= 1e-6.
@@ -78,7 +78,7 @@ def beyond_limit(determinant: Any, unknowns: Any) -> Any:
     return ca.logic_or(determinant >= 0, unknowns[1] > 2 * (np.log(8.0) - unknowns[0]) + 5)
 
 
-@lru_cache
+@graph_cache()
 def tip_map() -> Any:
     """Graph [log tip_angle, lambda] -> tip (2), its Jacobian (2, 2), energy, for a left-handed rod."""
     unknowns = ca.SX.sym("unknowns", 2)
@@ -86,7 +86,7 @@ def tip_map() -> Any:
     return ca.Function("tip_map", [unknowns], [tip, ca.jacobian(tip, unknowns), energy], {"cse": True})
 
 
-@lru_cache
+@graph_cache()
 def rod_newton() -> tuple[Any, Any]:
     """Build the graphs of one rod; same arguments and results as `multiple_shooting.rod_newton`.
 
@@ -122,7 +122,7 @@ def rod_newton() -> tuple[Any, Any]:
     return newton, ca.Function("rod_residual", [unknowns, pose], [norm, loads], options)
 
 
-@lru_cache
+@graph_cache()
 def rod_chord() -> Any:
     """Build (unknowns (3), pose (3), tangent (3, 3)) -> change of the unknowns: a Newton step with old derivatives.
 
@@ -136,7 +136,7 @@ def rod_chord() -> Any:
     return ca.Function("rod_chord", [unknowns, pose, tangent], [tangent[:, :2] @ (pose[:2] - reached)], {"cse": True})
 
 
-@lru_cache
+@graph_cache()
 def rod_curvature() -> Any:
     """Graph (unknowns (3), pose (3)) -> third derivatives of the energy that hold a tip coordinate twice.
 
@@ -152,7 +152,7 @@ def rod_curvature() -> Any:
     return ca.Function("rod_curvature", [unknowns, pose], [columns], {"cse": True})
 
 
-@lru_cache
+@graph_cache()
 def _pendulums(count: int) -> Any:
     log_tip_angle, u = ca.SX.sym("log_tip_angle"), ca.SX.sym("u")
     return ca.Function("pendulum", [log_tip_angle, u], list(pendulum(log_tip_angle, u)[:2])).map(count)
@@ -168,7 +168,7 @@ def nodes(unknowns: np.ndarray, angle: float, n_nodes: int) -> np.ndarray:
     return np.vstack([angle + hand * (delta[0] - delta), np.repeat(force, n_nodes, axis=1), hand * load * rate])
 
 
-@lru_cache
+@graph_cache()
 def retraction() -> Any:
     """Graph (unknowns, change) -> unknowns: how a step of Newton's method or a prediction is taken.
 
@@ -189,7 +189,7 @@ def retraction() -> Any:
     return ca.Function("retraction", [unknowns, change], [taken], {"cse": True})
 
 
-@lru_cache
+@graph_cache()
 def _determinants() -> Any:
     unknowns = ca.SX.sym("unknowns", 2)
     jacobian = tip_map()(unknowns)[1]

@@ -7,14 +7,14 @@ from functools import cached_property
 
 import numpy as np
 
-from ..frozen import freeze
+from ..frozen import Frozen, read_only
 from .robot import Robot
 from .rod import RodPhysics, sample_rod
 from .rod_physics import robot_physics
 
 
 @dataclass(frozen=True, eq=False)
-class Equilibrium:
+class Equilibrium(Frozen):
     """Static equilibrium of the rods for a held tip: it exists only if the solve converged.
 
     With U(p, q) the elastic energy and, if the rods have weight, its potential, force = dU/dp is what holds the joint
@@ -76,13 +76,10 @@ class Equilibrium:
     unstable_rods: tuple[int, ...]
     converged: bool = True
 
-    def __post_init__(self) -> None:
-        freeze(self)
-
     @cached_property
     def stiffness_eigenvalues(self) -> np.ndarray:
         """Eigenvalues of K, ascending, shape (2,) [N/m]."""
-        return np.asarray(np.linalg.eigvalsh((self.dforce_dp + self.dforce_dp.T) / 2))
+        return read_only(np.linalg.eigvalsh((self.dforce_dp + self.dforce_dp.T) / 2))
 
     @property
     def stable(self) -> bool:

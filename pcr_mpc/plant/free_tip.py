@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import threading
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from ..buffered import per_thread
 from ..errors import ConvergenceError, PCRError, UnreachableError, UnstableError, checked_vector
 from .chart import held_shapes
 from .equilibrium import Equilibrium
@@ -58,7 +57,7 @@ def forward_statics(robot: Robot, q: Any, force: Any = (0.0, 0.0), guess: Equili
         No stable pose was found.
     """
     q, force = robot.checked_angles("q", q), checked_vector("force", force, 2) + robot.tip_weight
-    solver = _solver(robot, threading.get_ident())
+    solver = _solver(robot)
     if guess is not None:
         _require_equilibrium(guess)
         return _follow(solver, guess, q, force)
@@ -112,7 +111,7 @@ def inverse_statics(
     """
     p, force = checked_vector("p", p, 2), checked_vector("force", force, 2) + robot.tip_weight
     robot.require_reachable(p)
-    solver = _solver(robot, threading.get_ident())
+    solver = _solver(robot)
     if guess is not None:
         if mode is not None:
             raise ValueError("give either guess, whose branch is followed, or mode, for a search")
@@ -380,6 +379,6 @@ def free_solver(robot: Robot) -> RodSolver:
     return RodSolver(robot, shooting_method(_SHOOTING, robot_layout(robot)))
 
 
-@lru_cache(maxsize=32)
-def _solver(robot: Robot, thread: int) -> RodSolver:
+@per_thread(maxsize=32)
+def _solver(robot: Robot) -> RodSolver:
     return free_solver(robot)

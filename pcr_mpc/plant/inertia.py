@@ -16,13 +16,13 @@ Y eta' - sin(delta) eta = -sin(alpha) (their Wronskian); second derivatives by d
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from scipy.special import roots_jacobi
 
+from ..buffered import graph_cache
 from .elastica import elliptic
 
 INERTIAS = ("none", "constant", "condensed", "full")
@@ -112,7 +112,7 @@ def _moments(shape: list[Any]) -> tuple[list[Any], list[list[Any]]]:
     return values, slopes
 
 
-@lru_cache
+@graph_cache()
 def rod_mass() -> Any:
     """Graph of one rod of unit length and unit line density.
 

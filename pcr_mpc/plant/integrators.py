@@ -16,13 +16,12 @@ dt |v| / L times the rods' share of the mass solves it to rounding.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache
 
 if TYPE_CHECKING:
     from .dynamics import Plant
@@ -68,14 +67,14 @@ class _Symbols:
         return ca.Function(name, [*self.inputs, *others], results, {"cse": True})
 
 
-@lru_cache
+@graph_cache()
 def stop_graph(n: int) -> Any:
     """Build (known, momentum) -> v."""
     s, momentum = _Symbols(n), ca.SX.sym("pi", 2)
     return s.function("stop", [momentum], [s.at_rest(momentum)])
 
 
-@lru_cache
+@graph_cache()
 def euler_graph(n: int) -> Any:
     """Build (known, x) -> p, q, momentum: a step of symplectic Euler."""
     s, x = _Symbols(n), ca.SX.sym("x", 4 + n)
@@ -88,7 +87,7 @@ def euler_graph(n: int) -> Any:
     return s.function("euler", [x], [x[:2] + s.dt * v, x[4:] + s.dt * s.u, momentum])
 
 
-@lru_cache
+@graph_cache()
 def first_half_graph(n: int) -> Any:
     """Build (known, x) -> p, q, momentum before the second kick."""
     s, x = _Symbols(n), ca.SX.sym("x", 4 + n)
@@ -104,7 +103,7 @@ def first_half_graph(n: int) -> Any:
     return s.function("first_half", [x], [x[:2] + drift, x[4:] + s.dt * s.u, momentum])
 
 
-@lru_cache
+@graph_cache()
 def second_half_graph(n: int) -> Any:
     """Build (known, momentum) -> v at the end."""
     s, momentum = _Symbols(n), ca.SX.sym("pi", 2)
@@ -113,7 +112,7 @@ def second_half_graph(n: int) -> Any:
     return s.function("second_half", [momentum], [s.at_rest(after)])
 
 
-@lru_cache
+@graph_cache()
 def stage_graph(n: int) -> Any:
     """Build (known, y, start, sum, [ahead, weight]) -> start + ahead y', sum + weight y' with y = [p, pi, q]."""
     s, (y, start, total) = _Symbols(n), (ca.SX.sym(name, 4 + n) for name in ("y", "start", "sum"))

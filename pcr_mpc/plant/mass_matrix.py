@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache
 from ..errors import ConvergenceError
 from ..frozen import read_only
 from .numbers import Kind
@@ -65,13 +64,13 @@ class CondensedMass:
         return read_only(mass), read_only(slopes)
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def robot_mass(kind: Kind, method: RodMethod) -> Any:
     """`mass_calls` as one list of instructions, if that is not too long."""
     return inlined(mass_calls(kind, method), method.mass())
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def mass_calls(kind: Kind, method: RodMethod) -> Any:
     """Graph of the mass matrix.
 

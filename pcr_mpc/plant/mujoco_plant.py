@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConvergenceError, PCRError, checked_number, checked_vector
+from ..frozen import Remade, set_once
 from .dynamics import Plant
 from .equilibrium import Equilibrium
 from .hinge_chain import settled_chains
@@ -18,7 +20,19 @@ from .robot import Robot
 from .rod_solver import Snap
 
 
-class MuJoCoPlant:
+@set_once(
+    "make a new MuJoCoPlant with it",
+    "robot",
+    "links",
+    "dt",
+    "substeps",
+    "extrapolated",
+    "n_states",
+    "method",
+    "integrator",
+    payload="call carry, which keeps the momentum, or reset, which takes it away",
+)
+class MuJoCoPlant(Remade):
     """The robot in motion as hinge chains in MuJoCo, behind the interface of `Plant`.
 
     Parameters
@@ -46,12 +60,16 @@ class MuJoCoPlant:
     what the last step returned. Any other x finds the chains in equilibrium, moving with the tip, on the branch that
     leads there from the last such x.
 
+    What it was made of can be read and not set. A pickled or copied plant is made of the same, and starts with a
+    `reset`.
+
     A rod that snaps does so in its own time; it is motion like any other, and ``snaps`` remains empty.
     """
 
     def __init__(
         self, robot: Robot, *, links: int = 40, dt: float = 1e-3, substeps: int = 2, extrapolated: bool = True
     ) -> None:
+        self.payload: float
         self._mujoco = _imported()
         links = checked_links(robot, links)
         if not 0.0 < dt < np.inf:
@@ -160,7 +178,7 @@ class MuJoCoPlant:
         return self._last.copy()
 
     def _take(self, payload: float) -> None:
-        self.payload = payload
+        self.__dict__["payload"] = payload
         loaded = replace(self.robot, tip_mass=self.robot.tip_mass + payload)
         self._model = self._mujoco.MjModel.from_xml_string(
             mjcf(loaded, links=self.links, timestep=self.dt / self.substeps, visible=False)
@@ -177,7 +195,7 @@ class MuJoCoPlant:
         model, data, step = self._model, self._data, self._mujoco.mj_step
         h = self.dt / self.substeps
         before = data.qpos.copy(), data.qvel.copy()
-        with self._complaints() as complaints:
+        with _WARNINGS.heard(self._mujoco) as complaints:
             for k in range(self.substeps):
                 start, end = q + k * h * rate, q + (k + 1) * h * rate
                 if self.extrapolated:
@@ -206,16 +224,47 @@ class MuJoCoPlant:
                 last=last,
             )
 
+
+class _Warnings:
+    """Warnings of MuJoCo, which it would print and write into a file in the working directory.
+
+    It knows one listener for all threads, and warns in the thread that steps.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._steps = 0  # under way, in all threads
+        self._before: Callable[[str], None] | None = None
+        self._heard = threading.local()
+
     @contextmanager
-    def _complaints(self) -> Iterator[list[str]]:
-        """Warnings of MuJoCo, which it would print and write into a file in the working directory."""
+    def heard(self, mujoco: Any) -> Iterator[list[str]]:
+        """Those of this thread."""
         complaints: list[str] = []
-        before = self._mujoco.get_mju_user_warning()
-        self._mujoco.set_mju_user_warning(complaints.append)
+        self._heard.here = complaints
+        with self._lock:
+            if not self._steps:
+                self._before = mujoco.get_mju_user_warning()
+                mujoco.set_mju_user_warning(self._listen)
+            self._steps += 1
         try:
             yield complaints
         finally:
-            self._mujoco.set_mju_user_warning(before)
+            self._heard.here = None
+            with self._lock:
+                self._steps -= 1
+                if not self._steps:
+                    mujoco.set_mju_user_warning(self._before)
+
+    def _listen(self, message: str) -> None:
+        here = getattr(self._heard, "here", None)
+        if here is not None:
+            here.append(message)
+        elif self._before is not None:
+            self._before(message)
+
+
+_WARNINGS = _Warnings()
 
 
 def _imported() -> Any:

@@ -37,12 +37,12 @@ deflection with both ends held: a conjugate point, and the rod is unstable.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..buffered import graph_cache
 from .robot import Robot
 from .rod import Layout, interpolated, propagation, unpacked
 
@@ -50,7 +50,7 @@ from .rod import Layout, interpolated, propagation, unpacked
 _DETERMINANT_ROUNDING = 1e-12
 
 
-@lru_cache
+@graph_cache()
 def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = None) -> tuple[Any, Any]:
     """Build the graphs of one rod in normalised units.
 

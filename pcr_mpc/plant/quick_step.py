@@ -29,7 +29,7 @@ class QuickStep:
     """
 
     def __init__(self, model: StepModel, solver: RodSolver, numbers: np.ndarray, *, compiled: bool) -> None:
-        self._model, self._solver, self._compiled = model, solver, compiled
+        self.model, self._solver, self._compiled = model, solver, compiled
         self._limits = limits(model)
         self._solves = _SOLVES[model.integrator]
         self._n, self._numbers = model.kind.n_rods, numbers
@@ -39,7 +39,7 @@ class QuickStep:
         self._known = True  # to the solver
 
     def _pair(self, corrections: int) -> tuple[BufferedFunction, BufferedFunction]:
-        function = step_function(self._model, corrections, details=True, compiled=self._compiled)
+        function = step_function(self.model, corrections, details=True, compiled=self._compiled)
         pair = BufferedFunction(function), BufferedFunction(function)
         for graph in pair:
             graph.inputs[3][:] = self._numbers

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, UnreachableError, checked_number, checked_vector
-from ..frozen import read_only
+from ..frozen import Frozen, read_only
 from ..toml_table import read_toml
 
 # SI units; wide enough for DNA and for bridges, and no product of a few such numbers overflows.
@@ -97,7 +97,7 @@ class Rod:
 
 
 @dataclass(frozen=True)
-class Robot:
+class Robot(Frozen):
     """A planar parallel continuum robot: rods joined at their tips by a pin that carries a mass.
 
     Attributes

@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from scipy.integrate import DOP853
+
+from ..buffered import graph_cache
+from ..frozen import Frozen
 
 # Explicit Runge-Kutta schemes as (A, b); where a rod's properties change along s, c is the row sums of A.
 SCHEMES: dict[str, tuple[np.ndarray, np.ndarray]] = {
@@ -49,7 +51,7 @@ class Layout:
 
 
 @dataclass(frozen=True, eq=False)
-class RodPhysics:
+class RodPhysics(Frozen):
     """What one rod has beyond the plain rod (uniform, straight, inextensible, weightless), normalised.
 
     Attributes
@@ -125,7 +127,7 @@ def interpolated(values: Any, s: Any) -> Any:
     return sum(values[k] * ca.fmax(0, 1 - ca.fabs(s * last - k)) for k in range(last + 1))
 
 
-@lru_cache
+@graph_cache()
 def propagation(steps: int, scheme: str = "rk4", layout: Layout | None = None) -> Any:
     """Propagate a rod over an arc length.
 
@@ -190,7 +192,7 @@ def _along(layout: Layout, physics: Any, s: Any, step: Any, nodes: np.ndarray) -
     return [_Here(weight, compliance, kappa + c * d_kappa, d_kappa / step, f + c * d_f, d_f / step) for c in nodes]
 
 
-@lru_cache
+@graph_cache()
 def _sampler(n_points: int, steps: int, layout: Layout | None) -> Any:
     return propagation(steps, "rk8", layout).map(n_points)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..buffered import graph_cache
 from . import elastica, inertia, multiple_shooting, shooting_inertia
 from .chart import HeldShape
 from .numbers import Kind
@@ -84,7 +84,7 @@ class RodMethod:
     layout: Layout | None = None
 
 
-@lru_cache
+@graph_cache()
 def shooting_method(shooting: Shooting, layout: Layout | None) -> RodMethod:
     """Multiple shooting, paper sec. 4, for rods of any layout; the unknowns are the nodes."""
     n = shooting.segments
@@ -114,7 +114,7 @@ def shooting_method(shooting: Shooting, layout: Layout | None) -> RodMethod:
     )
 
 
-@lru_cache
+@graph_cache()
 def closed_form_method() -> RodMethod:
     """Elliptic functions: exact for the uniform, straight, weightless rods that a `Robot` describes."""
     newton, residual = elastica.rod_newton()
@@ -134,13 +134,13 @@ def closed_form_method() -> RodMethod:
     )
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def warm_step(kind: Kind, method: RodMethod, iterations: int) -> Any:
     """`warm_calls` as one list of instructions, if that is not too long: a fifth faster, and slow to compile."""
     return inlined(warm_calls(kind, method, iterations), method.newton)
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def warm_calls(kind: Kind, method: RodMethod, iterations: int) -> Any:
     """Tangent predictor, a fixed number of Newton iterations and the verdict, for the whole robot in one graph.
 

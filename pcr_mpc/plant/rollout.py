@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache, per_thread
 from ..errors import PCRError, checked_array
-from ..frozen import freeze
+from ..frozen import Frozen
 from .dynamics import Plant
 from .equilibrium import Equilibrium
 from .robot import Robot
@@ -26,7 +24,7 @@ _MOST_STEPS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class Rollout:
+class Rollout(Frozen):
     """Motion of one robot, or of R robots: then every array has an axis of R in front.
 
     Attributes
@@ -46,9 +44,6 @@ class Rollout:
     x: np.ndarray
     residual: np.ndarray
     stepped: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def rollout(
@@ -168,7 +163,7 @@ def _moved(
     for first in range(0, steps, _STEPS):
         block = slice(first, min(steps, first + _STEPS))
         length = block.stop - first
-        graph = _many_steps(model, length, robots, *settings, threading.get_ident())
+        graph = _many_steps(model, length, robots, *settings)
         # CasADi puts robots and steps side by side, column by column: rows of these views.
         memory, start, told, of_robots = (place.T.reshape(robots, -1) for place in graph.inputs)
         results = [place.T.reshape(robots, length, -1) for place in graph.outputs]
@@ -181,11 +176,15 @@ def _moved(
     return x, verdicts[:, :, 0], np.asarray(good)
 
 
-@lru_cache(maxsize=8)
+@per_thread(maxsize=8)
 def _many_steps(
-    model: StepModel, steps: int, robots: int, corrections: int, compiled: bool, threads: int, caller: int
+    model: StepModel, steps: int, robots: int, corrections: int, compiled: bool, threads: int
 ) -> BufferedFunction:
-    """One graph for each thread of the caller's: its buffers are shared memory."""
+    return BufferedFunction(_many_steps_graph(model, steps, robots, corrections, compiled, threads))
+
+
+@graph_cache(maxsize=8)
+def _many_steps_graph(model: StepModel, steps: int, robots: int, corrections: int, compiled: bool, threads: int) -> Any:
     step = step_function(model, corrections, details=False, compiled=compiled)
     many = step.mapaccum("steps", steps, 2, {})
     memory, x, given, numbers = (ca.MX.sym(step.name_in(i), *step.size_in(i)) for i in range(4))
@@ -193,7 +192,7 @@ def _many_steps(
     graph = ca.Function("steps", [memory, x, told, numbers], many(memory, x, told, ca.repmat(numbers, 1, steps)))
     if robots > 1:
         graph = graph.map(robots, "thread", threads) if threads > 1 else graph.map(robots, "serial")
-    return BufferedFunction(graph)
+    return graph
 
 
 def _stepped(

@@ -16,19 +16,19 @@ derivatives of the discrete rod to rounding, and the integrals are those of the 
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..buffered import graph_cache
 from .multiple_shooting import Sweep
 from .rod import Layout, propagation, rod_ode, runge_kutta
 
 _PAIRS = [[a, b] for b in range(3) for a in range(b + 1)]  # of poses, as columns of second derivatives
 
 
-@lru_cache
+@graph_cache()
 def rod_mass(segments: int, steps: int, scheme: str, layout: Layout | None = None) -> Any:
     """Graph of one rod of unit length and unit line density.
 
@@ -66,7 +66,7 @@ def rod_mass(segments: int, steps: int, scheme: str, layout: Layout | None = Non
     return ca.Function("rod_mass", arguments, [mass, ca.vertcat(*(ca.horzcat(*row) for row in slopes))])
 
 
-@lru_cache
+@graph_cache()
 def _sweeps(segments: int) -> tuple[Any, Any]:
     """Graphs of what joins the segments, whose Jacobians stand side by side as all else does.
 
@@ -87,7 +87,7 @@ def _sweeps(segments: int) -> tuple[Any, Any]:
     )
 
 
-@lru_cache
+@graph_cache()
 def _segment(h: float, steps: int, scheme: str, layout: Layout | None) -> tuple[Any, Any, Any]:
     """Graphs of a segment of length h from z = [theta, n_x, n_y, m] on; with a layout also of s and the rod's numbers.
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from scipy.optimize import least_squares
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache
 from ..errors import ConvergenceError
 from .chart import held_shapes
 from .equilibrium import Equilibrium
@@ -24,7 +23,7 @@ _ACCEPTED_FRACTION = 1e-4
 _MAX_EVALUATIONS = 200  # of 320 poses solved, the slowest took 167
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def _residual_and_jacobians(robot: Robot, steps: int, scheme: str) -> Any:
     residual = robot_residual(robot, 1, steps, scheme)
     y, p, q = (ca.SX.sym(name, residual.size1_in(i)) for i, name in enumerate("Ypq"))
@@ -32,7 +31,7 @@ def _residual_and_jacobians(robot: Robot, steps: int, scheme: str) -> Any:
     return ca.Function("single_shooting", [y, p, q], [r, ca.jacobian(r, y), ca.jacobian(r, ca.vertcat(p, q))])
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def _judge(steps: int, scheme: str) -> Any:
     """Energy and drift of the integration that was solved, and conjugate points on eight nodes along it."""
     base, pose = ca.MX.sym("base", 4), ca.MX.sym("pose", 3)

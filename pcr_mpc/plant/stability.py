@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConvergenceError, PCRError, checked_vector
+from ..frozen import Frozen
 from . import elastica
 from .chart import HeldShape, critical_load, stable_shapes
 from .equilibrium import Equilibrium
@@ -25,7 +26,7 @@ _RESOLVED = 1e-5  # residual and drift at which the sweep is trusted
 
 
 @dataclass(frozen=True, eq=False)
-class Stability:
+class Stability(Frozen):
     """Verdict on one equilibrium.
 
     Attributes

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from ..buffered import per_thread
 from ..errors import ConvergenceError, checked_vector
 from .equilibrium import Equilibrium
 from .robot import Robot
@@ -90,7 +89,7 @@ def solve_statics(
     shooting = checked_shooting(segments, 1 if steps is None else steps, scheme)
     if steps is None and method in _WANTED_DRIFT:
         return _refined(robot, p, q, method, segments, guess)
-    solver = _solver(robot, method, shooting, threading.get_ident())
+    solver = _solver(robot, method, shooting)
     if isinstance(guess, Equilibrium):
         solver.start(guess.p, guess.q, _of(robot, guess).nodes)
         solver.move(p, q)
@@ -153,9 +152,8 @@ def checked_shooting(segments: int, steps: int, scheme: str) -> Shooting:
     return Shooting(int(segments), int(steps), scheme)
 
 
-@lru_cache(maxsize=32)
-def _solver(robot: Robot, method: str, shooting: Shooting, thread: int) -> RodSolver | SingleShooting:
-    """One solver a thread: its buffers are shared memory."""
+@per_thread(maxsize=32)
+def _solver(robot: Robot, method: str, shooting: Shooting) -> RodSolver | SingleShooting:
     return make_solver(robot, method, shooting)
 
 

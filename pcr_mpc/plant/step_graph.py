@@ -7,12 +7,12 @@ the same arithmetic, without Python in between.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..buffered import graph_cache
 from ..compiled import compiled as machine_code
 from .integrators import RK4_STAGES, euler_graph, first_half_graph, second_half_graph, stage_graph, stop_graph
 from .mass_matrix import robot_mass
@@ -182,7 +182,7 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
     return ca.Function("step", [memory, x, given, vector], [ca.densify(r) for r in results])
 
 
-@lru_cache(maxsize=32)
+@graph_cache(maxsize=32)
 def step_function(model: StepModel, corrections: int, *, details: bool, compiled: bool) -> Any:
     """`step_graph` as it is, or as machine code."""
     function = step_graph(model, corrections, details=details)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..buffered import graph_cache
 from ..errors import checked_array
 from .elastica import beyond_limit, pendulum
 from .equilibrium import Equilibrium
@@ -18,7 +18,7 @@ from .rod_physics import require_plain
 from .rod_solver import RodSolver
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def symbolic_dynamics(robot: Robot, hands: tuple[float, ...]) -> Any:
     """Equations of motion with the rods' unknowns as algebraic variables: closed form, nothing is iterated.
 

@@ -12,13 +12,12 @@ centreline is that of the closed form (see `elastica`), its unknowns follow (p, 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..buffered import BufferedFunction
+from ..buffered import BufferedFunction, graph_cache
 from .elastica import pendulum
 from .equilibrium import Equilibrium
 from .numbers import Kind
@@ -71,7 +70,7 @@ class CondensedWeight:
         return graph.outputs
 
 
-@lru_cache
+@graph_cache()
 def _rod_weight() -> tuple[Any, Any]:
     """Graphs of one rod of unit length and unit weight.
 
@@ -114,7 +113,7 @@ def _rod_weight() -> tuple[Any, Any]:
     )
 
 
-@lru_cache(maxsize=16)
+@graph_cache(maxsize=16)
 def robot_weight(kind: Kind) -> tuple[Any, Any]:
     """Graphs of plain rods: (unknowns (3, n), q (n), numbers) -> U_g [J], dU_g/d(p, q) (2 + n); second derivatives."""
     n = kind.n_rods
