@@ -21,9 +21,11 @@ from pcr_mpc import (
 )
 from pcr_mpc.control.limited_qp import LimitedQP
 from pcr_mpc.control.mpc import terminal_weight
-from pcr_mpc.control.qp import Reference, Rollout, build_qp
+from pcr_mpc.control.qp import Reference, build_qp
 from pcr_mpc.control.tuning import Limits
+from pcr_mpc.control.workspace import Check
 from pcr_mpc.linearisation.linear_limits import LinearLimits
+from pcr_mpc.linearisation.linear_model import LinearModels
 from pcr_mpc.linearisation.pose_limits import LimitWatch, PoseLimits
 from pcr_mpc.loop.trajectory import PickAndPlace
 from pcr_mpc.plant import elastica
@@ -113,11 +115,11 @@ def rows_for(x, model, p_high):
 def test_limited_qp_against_another_solver(problem):
     """The optimum of the limited problem, by SciPy's SLSQP on the plain problem."""
     tuning, x, model, qp = problem
-    free = LimitedQP(tuning, 2, DT).solve(qp, x, [model], None, soft_angles=False)
-    rollout = Rollout(6, 2)
-    highest = rollout(x, [model], free.inputs)[1:, 1].max()
+    free = LimitedQP(tuning, 2, DT).solve(qp, x, LinearModels.of([model]), None, soft_angles=False)
+    check = Check(6, 2)
+    highest = check.states(x, LinearModels.of([model]), free.inputs)[1:, 1].max()
     limits = rows_for(x, model, highest - 5e-4)
-    answer = LimitedQP(tuning, 2, DT, limits.kinds).solve(qp, x, [model], limits, soft_angles=False)
+    answer = LimitedQP(tuning, 2, DT, limits.kinds).solve(qp, x, LinearModels.of([model]), limits, soft_angles=False)
     assert "tip region" in answer.active
     assert answer.slack == {}
     size = len(qp.q)
@@ -127,7 +129,7 @@ def test_limited_qp_against_another_solver(problem):
     rows = qp.A.toarray()
 
     def tip(u):
-        return (highest - 5e-4 - rollout(x, [model], u)[1:, 1]) * 1e3
+        return (highest - 5e-4 - check.states(x, LinearModels.of([model]), u)[1:, 1]) * 1e3
 
     found = minimize(
         lambda u: u @ hessian @ u / 2 + qp.q @ u,
@@ -149,8 +151,8 @@ def test_limited_qp_against_another_solver(problem):
 def test_what_cannot_be_kept_gives_way_and_is_reported(problem):
     tuning, x, model, qp = problem
     limits = rows_for(x, model, x[1] - 0.02)  # it starts 20 mm outside
-    answer = LimitedQP(tuning, 2, DT, limits.kinds).solve(qp, x, [model], limits, soft_angles=False)
-    states = Rollout(6, 2)(x, [model], answer.inputs)
+    answer = LimitedQP(tuning, 2, DT, limits.kinds).solve(qp, x, LinearModels.of([model]), limits, soft_angles=False)
+    states = Check(6, 2).states(x, LinearModels.of([model]), answer.inputs)
     assert answer.slack["tip region"] == pytest.approx(states[1:, 1].max() - (x[1] - 0.02), rel=1e-3)
 
 

@@ -13,7 +13,7 @@ import casadi as ca
 
 from ..buffered import graph_cache
 
-# Graphs up to this many periods become one list of instructions; longer ones stay matrices, which take no time to build.
+# Graphs up to this many periods become one list of instructions; longer ones stay matrices, which are built at once.
 _UNROLLED = 12
 
 
@@ -24,7 +24,9 @@ class _Models:
         n_states = 4 + n
         single = packed.size2() == 1
         ends = [0, n_states**2, n_states * (n_states + 1), n_states * (n_states + 1 + n)]
-        self.a, self.b, self.c = [], [], []
+        self.a: list[Any] = []
+        self.b: list[Any] = []
+        self.c: list[Any] = []
         for k in range(1 if single else horizon):
             a, c, b, _ = ca.vertsplit(packed[:, k], [*ends, packed.size1()])
             a, b = ca.reshape(a, n_states, n_states)[:4, :], ca.reshape(b, n_states, n)[:4, :]
@@ -49,8 +51,8 @@ def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool
     Returns
     -------
     casadi.Function
-        (models (size, 1 or N), x (4 + n), states (4 + n, N), inputs (n, N), u_previous (n), weights (4), T, bounds (n, 4),
-        dt) -> P as `QuadraticProgram` holds it, q, l, u.
+        (models (size, 1 or N), x (4 + n), states (4 + n, N), inputs (n, N), u_previous (n), weights (4), T,
+        bounds (n, 4), dt) -> P as `QuadraticProgram` holds it, q, l, u.
     """
     n_states = 4 + n
     packed = ca.MX.sym("models", n_states * (n_states + 1 + n + 2), models)
@@ -73,7 +75,8 @@ def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool
         free = model.a[k] @ free + model.c[k]
         misses.append(free - states[:, k])
         responses.append(ca.horzcat(model.a[k] @ responses[k], model.b[k]))
-    rows, gradient = [], []
+    rows: list[Any] = []
+    gradient: list[Any] = []
     adjoint = terminal @ ca.horzcat(responses[horizon], misses[-1])
     for k in range(horizon - 1, -1, -1):
         block = model.b[k].T @ adjoint

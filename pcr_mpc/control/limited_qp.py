@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from scipy.linalg.lapack import dpotrf
 
 from ..errors import InfeasibleError
 from ..linearisation.linear_limits import LinearLimits
-from ..linearisation.linear_model import LinearModel
+from ..linearisation.linear_model import LinearModels
 from .osqp_solver import QPSolver, Solution
 from .qp import QuadraticProgram, constraint_matrix
 from .tuning import Tuning
@@ -117,7 +116,7 @@ class LimitedQP:
         self,
         qp: QuadraticProgram,
         x: np.ndarray,
-        models: Sequence[LinearModel],
+        models: LinearModels,
         limits: LinearLimits | None,
         *,
         soft_angles: bool,
@@ -186,14 +185,15 @@ class LimitedQP:
         return np.asarray(factor)
 
     def _poses(
-        self, x: np.ndarray, models: Sequence[LinearModel], limits: LinearLimits
+        self, x: np.ndarray, models: LinearModels, limits: LinearLimits
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows over all periods as (bounds) <= (rows) U <= (bounds), all over dt."""
         n, horizon, m = self._n, self._horizon, len(limits.kinds)
         response = np.zeros((len(x), self._size))
         rows, free = np.empty((horizon * m, self._size)), np.empty((horizon, m))
         for k in range(horizon):
-            model = models[k] if len(models) > 1 else models[0]
+            if k < len(models):
+                model = models[k]
             response = model.A @ response
             response[:, k * n : (k + 1) * n] = model.B
             x = model.A @ x + model.c

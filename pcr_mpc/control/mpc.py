@@ -14,9 +14,9 @@ from scipy.linalg.blas import dnrm2
 from ..errors import InfeasibleError, checked_array, checked_vector
 from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
-from ..linearisation.linear_model import LinearModel
+from ..linearisation.linear_model import LinearModel, LinearModels
 from .plan import Plan
-from .qp import Reference, assemble, model_sequence
+from .qp import QuadraticProgram, Reference, assemble, model_sequence
 from .tuning import Limits, Tuning
 from .workspace import Workspace
 
@@ -137,15 +137,15 @@ class LinearMPC:
         """
         began = time.perf_counter()
         sequence = model_sequence(models, self.tuning.horizon)
-        first = sequence[0]
-        n_states, n = first.B.shape
+        n, n_states = sequence.n, 4 + sequence.n
         x, u_previous = checked_vector("x", x, n_states), checked_vector("u_previous", u_previous, n)
         horizon = self.tuning.horizon
         wanted = checked_array("reference.states", reference.states, (horizon, n_states))
         feed_forward = checked_array("reference.inputs", reference.inputs, (horizon, n))
-        if self._first is not None and first is not self._first and _another_robot(self._first, first):
+        if self._first is not None and _another_robot(self._first, sequence[0]):
             self.reset()
         if self._terminal_weight is None or self._workspace is None:
+            first = models if isinstance(models, LinearModel) else models[0]
             self.prepare(first)
             self._first = first
         assert self._terminal_weight is not None
@@ -153,6 +153,22 @@ class LinearMPC:
         self._workspace.require(sequence)
         window = Reference(wanted, feed_forward)
         qp = assemble(x, sequence, window, u_previous, self.tuning, self.limits, self._terminal_weight)
+        return self.decide(qp, x, sequence, window, u_previous, pose_limits, began)
+
+    def decide(
+        self,
+        qp: QuadraticProgram,
+        x: np.ndarray,
+        models: LinearModels,
+        reference: Reference,
+        u_previous: np.ndarray,
+        pose_limits: LinearLimits | None,
+        began: float,
+    ) -> Plan:
+        """`solve` from the assembled QP on: `prepare` was called, the arguments are right, and assembling ``began``
+        at that time of `time.perf_counter`."""
+        assert self._workspace is not None
+        n = len(u_previous)
         problem = self.limits, float(dnrm2(qp.P)), float(dnrm2(qp.q))
         if not self._continues(*problem):
             self._forget()
@@ -161,13 +177,13 @@ class LinearMPC:
         updated = time.perf_counter()
         status, fallback = "solved", None
         try:
-            answer = self._workspace.solve(qp, x, sequence, pose_limits, self.limits, warm)
+            answer = self._workspace.solve(qp, x, models, pose_limits, self.limits, warm)
         except InfeasibleError as error:
             if self.tuning.fallback == "raise":
                 raise
             status, fallback = error.status, "softened"
             try:
-                answer = self._workspace.soften(qp, x, sequence, pose_limits)
+                answer = self._workspace.soften(qp, x, models, pose_limits)
             except InfeasibleError as again:
                 return self.fall_back(f"{status}; softened: {again.status}", x, reference, u_previous)
         if answer.slack and fallback is None:
@@ -175,12 +191,12 @@ class LinearMPC:
         solved = time.perf_counter()
         inputs = answer.inputs.reshape(-1, n)
         # OSQP keeps limits to its tolerance, this keeps them exactly.
-        inside = inputs[0] if fallback else self.limits.within_stops(inputs[0], x[4:], first.dt)
+        inside = inputs[0] if fallback else self.limits.within_stops(inputs[0], x[4:], models.dt)
         first_rates = self.limits.clipped(inside, u_previous)
         states = answer.states
         if states is None or inputs[0].tolist() != first_rates.tolist():
             inputs[0] = first_rates
-            states = self._workspace.rollout(x, sequence, inputs)
+            states = self._workspace.check.states(x, models, inputs)
         self._age = 0
         self._last = Plan(
             inputs=inputs,
@@ -242,7 +258,7 @@ class LinearMPC:
         if self._last is not None and self._last.models is not None and np.isfinite(x).all():
             assert self._workspace is not None
             models = self._last.models
-            states = self._workspace.rollout(x, model_sequence(models, self.tuning.horizon), inputs)
+            states = self._workspace.check.states(x, model_sequence(models, self.tuning.horizon), inputs)
         active = () if np.array_equal(wanted, asked) else self.limits.met_by(wanted, u_previous)
         self._last = Plan(inputs, states, models, status, fallback, active)
         return self._last

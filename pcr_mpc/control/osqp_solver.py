@@ -167,8 +167,10 @@ class QPSolver:
         self._require(core.update_data_vec(q=q, l=l, u=u), "update_data_vec")
         self._data = P, q, l, u
 
-    def solve(self, most: int | None = None) -> Solution:
+    def solve(self, most: int | None = None, *, certified: bool = True) -> Solution:
         """Solve the current data, in at most ``most`` iterations if that is less than ``max_iterations``.
+
+        Unless it is to be ``certified``, the residuals are left to the caller: NaN.
 
         Raises
         ------
@@ -204,7 +206,7 @@ class QPSolver:
                 limit=limit,
             )
         x, y = np.array(core.solution.x), np.array(core.solution.y)
-        primal, dual = self._residuals(x, y, *self._data)
+        primal, dual = self._residuals(x, y, *self._data) if certified else (math.nan, math.nan)
         return Solution(x, y, int(info.iter), float(info.run_time), primal, dual)
 
     def _residuals(

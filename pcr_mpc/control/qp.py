@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
-import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
-from ..buffered import BufferedFunction, graph_cache, per_thread
+from ..buffered import BufferedFunction, per_thread
 from ..errors import checked_array, checked_vector
 from ..frozen import read_only
-from ..linearisation.linear_model import LinearModel
+from ..linearisation.linear_model import LinearModel, LinearModels
+from .condensing import condensing
 from .tuning import Limits, Tuning
 
 
@@ -87,9 +86,7 @@ def build_qp(
         T, for instance the cost-to-go of the LQR.
     """
     sequence = model_sequence(models, tuning.horizon)
-    n_states, n = sequence[0].B.shape
-    if any(model.dt != sequence[0].dt for model in sequence):
-        raise ValueError("models have different periods dt")
+    n, n_states = sequence.n, 4 + sequence.n
     x, u_previous = checked_vector("x", x, n_states), checked_vector("u_previous", u_previous, n)
     wanted = checked_array("reference.states", reference.states, (tuning.horizon, n_states))
     feed_forward = checked_array("reference.inputs", reference.inputs, (tuning.horizon, n))
@@ -101,7 +98,7 @@ def build_qp(
 
 def assemble(
     x: np.ndarray,
-    models: Sequence[LinearModel],
+    models: LinearModels,
     reference: Reference,
     u_previous: np.ndarray,
     tuning: Tuning,
@@ -109,69 +106,37 @@ def assemble(
     terminal_weight: np.ndarray,
 ) -> QuadraticProgram:
     """`build_qp` for arguments that are known to be right; one model or N of them."""
-    n_states, n = models[0].B.shape
-    single = len(models) == 1
-    function = _condensing(tuning.horizon, n, single, tuning.velocity_weight > 0, tuning.angle_weight > 0)
-    a, b, c, start, states, inputs, previous, weights, terminal, bounds, dt = function.inputs
-    for k, model in enumerate(models):
-        a[:, k * n_states : (k + 1) * n_states] = model.A
-        b[:, k * n : (k + 1) * n] = model.B
-        c[k * n_states : (k + 1) * n_states] = model.c
+    n = models.n
+    function = _buffered(tuning.horizon, n, len(models), tuning.velocity_weight > 0, tuning.angle_weight > 0)
+    columns, start, states, inputs, previous, weights, terminal, bounds, dt = function.inputs
+    columns.reshape(models.columns.shape, order="F")[:] = models.columns
     start[:] = x
-    states.reshape((n_states, -1), order="F")[:] = reference.states.T
+    states.reshape((4 + n, -1), order="F")[:] = reference.states.T
     inputs.reshape((n, -1), order="F")[:] = reference.inputs.T
     previous[:] = u_previous
-    weights[:] = tuning.position_weight, tuning.velocity_weight, tuning.angle_weight, tuning.input_weight
+    weights[:] = stage_weights(tuning)
     terminal[:] = terminal_weight
-    bounds[:, 0] = limits.rate
-    bounds[:, 1] = limits.rate_change
-    bounds[:, 2] = limits.angle_lower
-    bounds[:, 3] = limits.angle_upper
-    dt[0] = models[0].dt
+    bounds[:] = motor_bounds(limits)
+    dt[0] = models.dt
     function()
     p, q, lower, upper = function.outputs
-    return QuadraticProgram(p.copy(), q.copy(), constraint_matrix(tuning.horizon, n),
-                            lower.copy(), upper.copy())  # fmt: skip
+    return QuadraticProgram(p.copy(), q.copy(), constraint_matrix(tuning.horizon, n), lower.copy(), upper.copy())
 
 
-class Rollout:
-    """Predicts the states of a plan: one graph for a whole horizon.
-
-    Parameters
-    ----------
-    horizon, n : int
-        Control periods, motors.
-    """
-
-    def __init__(self, horizon: int, n: int) -> None:
-        self._n_states, self._n = 4 + n, n
-        self._functions = {single: BufferedFunction(_rollout(horizon, n, single)) for single in (True, False)}
-
-    def __call__(self, x: np.ndarray, models: Sequence[LinearModel], inputs: np.ndarray) -> np.ndarray:
-        """States at the ends of the periods, x first, shape (N + 1, 4 + n); one model or N of them."""
-        function = self._functions[len(models) == 1]
-        a, b, c, start, u = function.inputs
-        for k, model in enumerate(models):
-            a[:, k * self._n_states : (k + 1) * self._n_states] = model.A
-            b[:, k * self._n : (k + 1) * self._n] = model.B
-            c[k * self._n_states : (k + 1) * self._n_states] = model.c
-        start[:] = x
-        u.reshape(-1)[:] = inputs.reshape(-1)
-        function()
-        return function.outputs[0].reshape((self._n_states, -1), order="F").T.copy()
+@per_thread(maxsize=32)
+def _buffered(horizon: int, n: int, models: int, velocity: bool, angle: bool) -> BufferedFunction:
+    return BufferedFunction(condensing(horizon, n, models, velocity=velocity, angle=angle))
 
 
-@graph_cache(maxsize=32)
-def _rollout(horizon: int, n: int, single: bool) -> Any:
-    n_states, count = 4 + n, 1 if single else horizon
-    a, b = ca.SX.sym("A", n_states, count * n_states), ca.SX.sym("B", n_states, count * n)
-    c, x, u = ca.SX.sym("c", count * n_states), ca.SX.sym("x", n_states), ca.SX.sym("u", horizon * n)
-    states = [x]
-    for k in range(horizon):
-        i = 0 if single else k
-        rows, columns = slice(i * n_states, (i + 1) * n_states), slice(i * n, (i + 1) * n)
-        states.append(a[:, rows] @ states[-1] + b[:, columns] @ u[k * n : (k + 1) * n] + c[rows])
-    return ca.Function("rollout", [a, b, c, x, u], [ca.vertcat(*states)])
+def stage_weights(tuning: Tuning) -> tuple[float, ...]:
+    """Weights as `condensing` takes them."""
+    return tuning.position_weight, tuning.velocity_weight, tuning.angle_weight, tuning.input_weight
+
+
+def motor_bounds(limits: Limits) -> np.ndarray:
+    """Limits as `condensing` takes them, shape (n, 4)."""
+    ones = np.ones(len(limits.angle_lower))
+    return np.stack([limits.rate * ones, limits.rate_change * ones, limits.angle_lower, limits.angle_upper], axis=1)
 
 
 @lru_cache(maxsize=16)
@@ -187,8 +152,10 @@ def constraint_matrix(horizon: int, n: int) -> sp.csc_matrix:
     return matrix
 
 
-def model_sequence(models: LinearModel | Sequence[LinearModel], horizon: int) -> Sequence[LinearModel]:
-    """One model as a list, or the models of all periods; ValueError if their number or shapes are wrong."""
+def model_sequence(models: LinearModel | Sequence[LinearModel], horizon: int) -> LinearModels:
+    """One model, or the models of all periods; ValueError if their number, shapes or periods are wrong."""
+    if isinstance(models, LinearModels) and len(models) in (1, horizon):
+        return models
     sequence: Sequence[LinearModel] = [models] if isinstance(models, LinearModel) else models
     if not isinstance(models, LinearModel) and len(sequence) != horizon:
         raise ValueError(f"models has {len(sequence)} entries, expected 1 or the horizon {horizon}")
@@ -197,103 +164,6 @@ def model_sequence(models: LinearModel | Sequence[LinearModel], horizon: int) ->
         shapes = model.A.shape, model.B.shape, model.c.shape
         if shapes != ((4 + n, 4 + n), (4 + n, n), (4 + n,)):
             raise ValueError(f"A, B, c of a model have shapes {shapes}, expected those of {n} motors")
-    return sequence
-
-
-@per_thread(maxsize=32)
-def _condensing(horizon: int, n: int, single: bool, velocity: bool, angle: bool) -> BufferedFunction:
-    return BufferedFunction(_condensing_graph(horizon, n, single, velocity, angle))
-
-
-@graph_cache(maxsize=32)
-def _condensing_graph(horizon: int, n: int, single: bool, velocity: bool, angle: bool) -> Any:
-    """Linear models, state and reference to (P, q, l, u) in one graph."""
-    n_states = 4 + n
-    count = 1 if single else horizon
-    a_all, b_all, c_all = (
-        ca.SX.sym(name, *shape)
-        for name, shape in (
-            ("A", (n_states, count * n_states)),
-            ("B", (n_states, count * n)),
-            ("c", (count * n_states, 1)),
-        )
-    )
-    x = ca.SX.sym("x", n_states)
-    states, inputs = ca.SX.sym("states", n_states, horizon), ca.SX.sym("inputs", n, horizon)
-    previous, weights = ca.SX.sym("previous", n), ca.SX.sym("weights", 4)
-    terminal, bounds, dt = (
-        ca.SX.sym("terminal", n_states, n_states),
-        ca.SX.sym("bounds", n, 4),
-        ca.SX.sym("dt"),
-    )
-
-    def part(block: Any, k: int, width: int) -> Any:
-        k = 0 if single else k
-        return block[:, k * width : (k + 1) * width]
-
-    a, b, c = [], [], []
-    for k in range(horizon):
-        # The motors are exact integrators: writing their rows as constants prunes the graph.
-        mine = part(a_all, k, n_states)
-        a.append(ca.vertcat(mine[:4, :], ca.horzcat(ca.SX(n, 4), ca.SX.eye(n))))
-        b.append(ca.vertcat(part(b_all, k, n)[:4, :], dt * ca.SX.eye(n)))
-        c.append(ca.vertcat(c_all[(0 if single else k) * n_states :][:4], ca.SX(n, 1)))
-    # A weight of zero is left out of the graph, not multiplied.
-    used = [weights[0], weights[1] if velocity else ca.SX(1, 1), weights[2] if angle else ca.SX(1, 1)]
-    stage = ca.diag(ca.vertcat(used[0], used[0], used[1], used[1], *[used[2]] * n))
-
-    # Free response (no input) and, backwards, the gradient of its cost: the adjoint.
-    free = [x]
-    for k in range(horizon):
-        free.append(a[k] @ free[k] + c[k])
-    adjoint = [terminal @ (free[-1] - states[:, -1])]
-    for k in range(horizon - 1, 0, -1):
-        adjoint.insert(0, stage @ (free[k] - states[:, k - 1]) + a[k].T @ adjoint[0])
-    gradient = ca.vertcat(*(b[k].T @ adjoint[k] - weights[3] * inputs[:, k] for k in range(horizon)))
-
-    responses: dict[tuple[int, int], Any] = {}
-
-    def response(k: int, i: int) -> Any:
-        """dx_k / du_i; with one model it depends on k - i alone."""
-        key = (k - i, 0) if single else (k, i)
-        if key not in responses:
-            responses[key] = b[i] if k == i + 1 else a[k - 1] @ response(k - 1, i)
-        return responses[key]
-
-    # Block (i, j) of the Hessian is the sum over k > j of (dx_k/du_i)' Q_k (dx_k/du_j). With one model the terms
-    # before the last period are those of block (i + 1, j + 1) and one more.
-    blocks = [[ca.SX(n, n) for _ in range(horizon)] for _ in range(horizon)]
-    ends: dict[tuple[int, int], Any] = {}
-    for j in range(horizon - 1, -1, -1):
-        last = terminal @ response(horizon, j)
-        weighted = {k: stage @ response(k, j) for k in range(j + 1, horizon)}
-        for i in range(j + 1):
-            if not single:
-                blocks[i][j] = sum((response(k, i).T @ w for k, w in weighted.items()), ca.SX(n, n))
-            elif j < horizon - 1:
-                blocks[i][j] = blocks[i + 1][j + 1] + response(horizon - 1, i).T @ weighted[horizon - 1]
-            ends[i, j] = blocks[i][j] + response(horizon, i).T @ last
-    hessian = ca.vertcat(
-        *(ca.horzcat(*(ends.get((i, j), ca.SX(n, n)) for j in range(horizon))) for i in range(horizon))
-    )
-    hessian += weights[3] * ca.SX.eye(horizon * n)
-    upper_triangle = ca.vertcat(*(hessian[: j + 1, j] for j in range(horizon * n)))
-
-    rate, change, lower, upper = (bounds[:, i] for i in range(4))
-    first = ca.vertcat(previous, ca.SX(n * (horizon - 1), 1))
-    l_all = [
-        -ca.repmat(rate, horizon, 1),
-        first - ca.repmat(change, horizon, 1),
-        ca.repmat((lower - x[4:]) / dt, horizon, 1),
-    ]
-    u_all = [
-        ca.repmat(rate, horizon, 1),
-        first + ca.repmat(change, horizon, 1),
-        ca.repmat((upper - x[4:]) / dt, horizon, 1),
-    ]
-    return ca.Function(
-        "condense",
-        [a_all, b_all, c_all, x, states, inputs, previous, weights, terminal, bounds, dt],
-        [upper_triangle, gradient, ca.vertcat(*l_all), ca.vertcat(*u_all)],
-        {"cse": True},
-    )
+    if any(model.dt != sequence[0].dt for model in sequence):
+        raise ValueError("models have different periods dt")
+    return LinearModels.of(sequence)

@@ -36,6 +36,8 @@ class Model:
         Follow the scene's time table of what the tip carries, in the feed-forward and in what is linearised.
     predict_delay : bool
         Plan from where the commands that are on the way will have brought the robot.
+    compiled : bool
+        Run as machine code where there is a C compiler: the same numbers, several times faster.
     """
 
     method: str = "closed_form"
@@ -46,6 +48,7 @@ class Model:
     linearise: str = "here"
     payload: bool = True
     predict_delay: bool = True
+    compiled: bool = True
 
 
 @dataclass(frozen=True)
@@ -203,6 +206,7 @@ def load_tuning(path: str | Path) -> Tuning:
                 linearise=model.text("linearise", Model.linearise, choices=LINEARISE),
                 payload=model.boolean("payload", Model.payload),
                 predict_delay=model.boolean("predict_delay", Model.predict_delay),
+                compiled=model.boolean("compiled", Model.compiled),
             ),
             observer=noise if observed else None,
         )

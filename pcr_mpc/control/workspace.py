@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from ..buffered import BufferedFunction
+from ..compiled import fastest
 from ..errors import InfeasibleError
 from ..linearisation.linear_limits import LinearLimits
-from ..linearisation.linear_model import LinearModel
+from ..linearisation.linear_model import LinearModel, LinearModels
+from .condensing import checking
 from .limited_qp import Limited, LimitedQP, active_kinds
-from .osqp_solver import QPSolver
-from .qp import QuadraticProgram, Rollout, constraint_matrix
+from .osqp_solver import QPSolver, Solution
+from .qp import QuadraticProgram, constraint_matrix, motor_bounds
 from .tuning import Limits, Tuning
 
 _FEWEST_ITERATIONS = 10  # with which OSQP is tried at all
@@ -37,7 +39,7 @@ class Workspace:
         self._limited: dict[tuple[str, ...], LimitedQP] = {}
         self._limits_matter = False  # in the last plan, beside those on the rates
         self._spent, self._inside = 0, 0.0  # iterations and seconds of OSQP in this control step
-        self.rollout = Rollout(tuning.horizon, self.n)
+        self.check = Check(tuning.horizon, self.n, compiled=tuning.model.compiled)
 
     def limited(self, kinds: tuple[str, ...]) -> LimitedQP:
         """Solver for limits of these kinds, made once."""
@@ -52,13 +54,11 @@ class Workspace:
         for solver in self._limited.values():
             solver.reset()
 
-    def require(self, models: Sequence[LinearModel]) -> None:
-        """Raise if a model is for another robot or period."""
-        for model in models:
-            if (model.B.shape[1], model.dt) == (self.n, self.dt):
-                continue
+    def require(self, models: LinearModels) -> None:
+        """Raise if the models are for another robot or period."""
+        if (models.n, models.dt) != (self.n, self.dt):
             raise ValueError(
-                f"model has {model.B.shape[1]} motors and dt = {model.dt} s, but this controller was built for "
+                f"model has {models.n} motors and dt = {models.dt} s, but this controller was built for "
                 f"{self.n} and {self.dt} s; make a new one"
             )
 
@@ -66,7 +66,7 @@ class Workspace:
         self,
         qp: QuadraticProgram,
         x: np.ndarray,
-        models: Sequence[LinearModel],
+        models: LinearModels,
         pose_limits: LinearLimits | None,
         limits: Limits,
         warm: np.ndarray | None,
@@ -84,13 +84,12 @@ class Workspace:
                 self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
                 if warm is not None:
                     self._rates_only.warm_start(warm)
-                solution = self._rates_only.solve()
+                solution = self._rates_only.solve(certified=False)
             except InfeasibleError as error:
                 self._count(error)
             else:
-                states = self.rollout(x, models, solution.x)
-                angles = states[1:, 4:]
-                broken = max(float((limits.angle_lower - angles).max()), float((angles - limits.angle_upper).max()))
+                states, primal, dual, broken = self.check(x, models, solution, qp, limits)
+                solution = replace(solution, primal_residual=primal, dual_residual=dual)
                 if pose_limits is not None:
                     rows = states[1:] @ pose_limits.C.T
                     broken = max(
@@ -102,7 +101,7 @@ class Workspace:
         return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
 
     def soften(
-        self, qp: QuadraticProgram, x: np.ndarray, models: Sequence[LinearModel], pose_limits: LinearLimits | None
+        self, qp: QuadraticProgram, x: np.ndarray, models: LinearModels, pose_limits: LinearLimits | None
     ) -> Limited:
         """Solve with the angle limits softened too, with the iterations that `solve` has left."""
         return self._solve_whole(qp, x, models, pose_limits, None, soft_angles=True)
@@ -111,7 +110,7 @@ class Workspace:
         self,
         qp: QuadraticProgram,
         x: np.ndarray,
-        models: Sequence[LinearModel],
+        models: LinearModels,
         pose_limits: LinearLimits | None,
         warm: np.ndarray | None,
         soft_angles: bool,
@@ -139,3 +138,49 @@ class Workspace:
     def _count(self, error: InfeasibleError) -> None:
         self._spent += error.details.get("iterations", 0)
         self._inside += error.details.get("run_time", 0.0)
+
+
+class Check:
+    """What inputs lead to, and how good they are as a solution (see `checking`).
+
+    Parameters
+    ----------
+    horizon, n : int
+        Control periods, motors.
+    compiled : bool
+        Whether to run as machine code where there is a compiler.
+    """
+
+    def __init__(self, horizon: int, n: int, *, compiled: bool = False) -> None:
+        self._horizon, self._n, self._compiled = horizon, n, compiled
+        self._graphs: dict[int, BufferedFunction] = {}
+        self._limits: Limits | None = None
+
+    def __call__(
+        self, x: np.ndarray, models: LinearModels, solution: Solution, qp: QuadraticProgram, limits: Limits
+    ) -> tuple[np.ndarray, float, float, float]:
+        """States, shape (N + 1, 4 + n), residuals of the rates' rows and of the gradient, excess of an angle [rad]."""
+        graph = self._graph(len(models))
+        _, _, _, y, p, q, lower, upper, bounds, _ = graph.inputs
+        y[:], p[:], q[:], lower[:], upper[:] = solution.y, qp.P, qp.q, qp.l, qp.u
+        bounds[:] = motor_bounds(limits)
+        states = self.states(x, models, solution.x)
+        primal, dual, excess = graph.outputs[1].tolist()
+        return states, primal, dual, excess
+
+    def states(self, x: np.ndarray, models: LinearModels, inputs: np.ndarray) -> np.ndarray:
+        """States at the ends of the periods, x first, shape (N + 1, 4 + n); one model or N of them."""
+        graph = self._graph(len(models))
+        columns, start, rates = graph.inputs[:3]
+        columns.reshape(models.columns.shape, order="F")[:] = models.columns
+        start[:] = x
+        rates.reshape((self._n, -1), order="F")[:] = inputs.reshape((-1, self._n)).T
+        graph.inputs[-1][:] = models.dt
+        graph()
+        return graph.outputs[0].T.copy()
+
+    def _graph(self, models: int) -> BufferedFunction:
+        if models not in self._graphs:
+            graph = fastest(checking(self._horizon, self._n, models), self._compiled)
+            self._graphs[models] = BufferedFunction(graph)
+        return self._graphs[models]

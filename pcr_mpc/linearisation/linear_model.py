@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, overload
 
 import control
 import numpy as np
@@ -46,3 +47,63 @@ class LinearModel(Frozen):
         n_states, n_inputs = self.B.shape
         output = np.eye(2, n_states)
         return control.ss(self.A, self.B, output, np.zeros((2, n_inputs)), self.dt)
+
+
+class LinearModels(Sequence[LinearModel]):
+    """Linear models of consecutive periods, as the columns that graphs write and read.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (size, K)
+        [vec(A), c, vec(B), vec(E)] of each.
+    dt : float
+        Period [s].
+    force : ndarray, shape (2,)
+        The external force that they were made for [N].
+    """
+
+    def __init__(self, columns: np.ndarray, dt: float, force: np.ndarray) -> None:
+        self.columns, self.dt, self.force = columns, dt, force
+        self._n_states = n_states(len(columns))
+
+    @classmethod
+    def of(cls, models: Sequence[LinearModel]) -> LinearModels:
+        """Models that were made one by one."""
+        if isinstance(models, LinearModels):
+            return models
+        parts = [[m.A.ravel("F"), m.c, m.B.ravel("F"), m.E.ravel("F")] for m in models]
+        return cls(np.stack([np.concatenate(each) for each in parts], axis=1), models[0].dt, models[0].force)
+
+    @property
+    def n(self) -> int:
+        """Motors."""
+        return int(self._n_states - 4)
+
+    def __len__(self) -> int:
+        return int(self.columns.shape[1])
+
+    @overload
+    def __getitem__(self, k: int) -> LinearModel: ...
+    @overload
+    def __getitem__(self, k: slice) -> LinearModels: ...
+    def __getitem__(self, k: int | slice) -> LinearModel | LinearModels:
+        if isinstance(k, slice):
+            return LinearModels(self.columns[:, k], self.dt, self.force)
+        m = self._n_states
+        a, c, b, e = np.split(self.columns[:, k].copy(), [m * m, m * (m + 1), m * (2 * m - 3)])
+        shaped = (part.reshape(m, -1, order="F") for part in (a, b, e))
+        a, b, e = shaped
+        return LinearModel(a, b, c, e, self.dt, self.force.copy())
+
+
+def column_size(n_states: int) -> int:
+    """Numbers of a model as a column."""
+    return n_states * (2 * n_states - 1)
+
+
+def n_states(size: int) -> int:
+    """States of a model whose column has ``size`` numbers."""
+    found = round((1 + (1 + 8 * size) ** 0.5) / 4)
+    if column_size(found) != size:
+        raise ValueError(f"a column of {size} numbers holds no linear model")
+    return found

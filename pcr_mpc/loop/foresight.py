@@ -1,4 +1,4 @@
-"""What a controller knows at the start of a decision: where commands take the robot, and linear models from there on."""
+"""What a controller knows when it decides: where commands take the robot, and linear models from there on."""
 
 from __future__ import annotations
 
@@ -145,8 +145,8 @@ class Foresight:
                 self._graph()
                 if good[j] < 1.0:
                     raise ConvergenceError(
-                        f"no linear model at p = {x[:2]} m, q = {x[4:]} rad, {j} periods ahead: the rods get there, and "
-                        "do not stay; keep away from this pose",
+                        f"no linear model at p = {x[:2]} m, q = {x[4:]} rad, {j} periods ahead: the rods get there, "
+                        "and do not stay; keep away from this pose",
                         residual=float("nan"), iterations=0, last=x,
                     )  # fmt: skip
         if good[-1] < 1.0:

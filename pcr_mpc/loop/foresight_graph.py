@@ -1,9 +1,9 @@
 """The first half of a control step as one graph: from what is measured to linear models along the plan, and to the QP.
 
-The estimate is corrected, the commands on the way are applied, and the rods are taken along to every place that needs a
-linear model: one for each period of delay, one where the robot will then be, one for each later period of the last plan.
-These places are a line in time: in the next control period each is where its neighbour is now, so that the rods of a place
-start from its neighbour's, and only the last of them has a way to go.
+The estimate is corrected, the commands on the way are applied, and the rods are taken along to every place that needs
+a linear model: one for each period of delay, one where the robot will then be, one for each later period of the last
+plan. These places are a line in time: in the next control period each is where its neighbour is now, so that the rods
+of a place start from its neighbour's, and only the last of them has a way to go.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
     Returns
     -------
     casadi.Function
-        With named inputs and outputs; one column of ``followed`` (records) and ``models`` for each place. ``good`` is 1 for each
-        place, and then for the motor target, whose rods have followed, else 0.
+        With named inputs and outputs; one column of ``followed`` (records) and ``models`` for each place. ``good`` is 1
+        for each place, and then for the motor target, whose rods have followed, else 0.
     """
     n, count = model.kind.n_rods, places.count
     size, of_target = sizes(model), sizes(target)
@@ -107,7 +107,8 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
     shift, target_record, target_good = _shifted(target, given, force, n)
     states = given.states + ca.vertcat(ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon))
     outputs = {
-        "good": ca.vertcat(good.T, target_good), "corrected": ca.vertcat(x, force), "arriving": arriving, "places": states_of,
+        "good": ca.vertcat(good.T, target_good), "corrected": ca.vertcat(x, force), "arriving": arriving,
+        "places": states_of,
         "followed": records, "models": models, "moved_shift": shift, "followed_target": target_record, "wanted": states,
     }  # fmt: skip
     if condense is not None:
@@ -155,7 +156,7 @@ def _shifted(target: StepModel, given: Any, force: Any, n: int) -> tuple[Any, An
     """Angles to add to those of the reference so that the rods carry the observed force too, at the end of the window.
 
     One Newton iteration a period: where tip and force do not change it converges, which is what makes the controller
-    free of offset under a constant load. The least motion does it, G'(G G')^-1, two by two however many motors there are.
+    free of offset under a constant load. The least motion does it, G'(G G')^-1, two by two for any number of motors.
     """
     end = given.states[:, -1]
     pose = ca.vertcat(end[:2], end[4:] + given.shift)
