@@ -74,6 +74,16 @@ class TrackingController:
         self._inverse = MotorTarget(self.robot)
         self._law: Law | None = None
 
+    @property
+    def tuning(self) -> Tuning:
+        """What it was told."""
+        return self._tuning
+
+    @property
+    def reference(self) -> InverseDynamics:
+        """Inverse dynamics of the scene's reference, from `start` on."""
+        return self._reference
+
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
         tail, inertia = self._tuning.horizon + self._delay, self._tuning.model.inertia
@@ -117,6 +127,7 @@ class TrackingController:
             if all(map(math.isfinite, x[:2].tolist() + x[4:].tolist())):
                 observer.correct(x[:2], x[4:])
             x, force = observer.x, observer.force
+        estimate = x
         began = time.perf_counter()
         failure, now, ahead = "", None, x
         models: LinearModel | list[LinearModel] | None = None
@@ -150,7 +161,7 @@ class TrackingController:
             self._predicts = better if isinstance(better, LinearModel) else better[0]
         if observer is not None:
             observer.predict(self._predicts, arriving)
-        return Decision(plan.inputs[0], plan, linearised)
+        return Decision(plan.inputs[0], plan, linearised, estimate, force)
 
     def _linearise(self, x: np.ndarray, k: int, force: np.ndarray) -> LinearModel | list[LinearModel]:
         here = self._model_at(k + self._delay, x, self._u, force)

@@ -56,11 +56,14 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"inside the solver {_percent(summary['solver_share'])} of the control steps' time",
         f"QP iterations     p50 {iterations['p50']}, max {iterations['max']}",
         f"peak torque       {summary['peak_torque_Nm']:.3f} N m (limit {summary['torque_limit_Nm']:g}, soft)",
+        f"poses beyond      {_counts({k: v for k, v in summary['pose_violations'].items() if v})}",
         f"limits active in  {_counts(summary['active_limits'])} of {summary['control_steps']} periods",
         f"largest slack     {', '.join(f'{k} {v:.3g}' for k, v in summary['slack'].items()) or 'none'}",
         f"limit violations  {summary['limit_violations']}",
         f"fall-backs        {summary['fallbacks']}",
+        f"deadline misses   {summary['deadline_misses']}",
         f"failures          {summary['failures']}",
+        *(f"warning           {event['message']}" for event in summary["events"] if event["kind"] == "warning"),
     ]
     return "\n".join(lines)
 
