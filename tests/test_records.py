@@ -120,7 +120,7 @@ def test_the_record_says_what_each_array_is(run, files):
     assert "delay" in about["u"]
     assert "got" in about["applied"]
     assert len(arrays["applied"]) == len(run.t) - 1
-    said = dict((key, value) for key, value in text["dict"])
+    said = dict(text["dict"])
     assert dict(said["versions"]["dict"])["numpy"] == np.__version__
     assert said["tuning"]["name"] == "sensors"
 
@@ -190,7 +190,7 @@ def test_what_is_no_record_is_refused_by_name(files, tmp_path):
     with pytest.raises(ModelError, match="format of the record is none"):
         load_run(tmp_path)
     np.savez(tmp_path / "run.npz", **{k: v for k, v in parts.items() if k != "x"})
-    with pytest.raises(ModelError, match="no complete record.*x"):
+    with pytest.raises(ModelError, match=r"no complete record.*x"):
         load_run(tmp_path)
     parts["record"] = np.array(str(parts["record"]).replace('"class": "Lemniscate"', '"class": "os"'))
     np.savez(tmp_path / "run.npz", **parts)

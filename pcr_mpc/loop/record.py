@@ -37,7 +37,7 @@ ARRAYS = {
     "decision_time": "time that each decision is taken to have cost [s]",
     "plant_time": "wall time of each plant step [s]",
     "control_time": "of each control step: total, linearisation, QP update, QP solution, of that inside the solver "
-    "(wall time), and CPU time [s]",
+    "(all wall time), and CPU time of its thread [s]",
     "iterations": "of the solver in each control period",
 }
 _DERIVED = {

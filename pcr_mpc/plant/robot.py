@@ -194,6 +194,11 @@ class Robot:
         return read_only(np.array([rod.bending_stiffness for rod in self.rods]))
 
     @cached_property
+    def force_scale(self) -> float:
+        """Sum of EI/L^2, the size of the rods' forces [N]."""
+        return float((self.stiffnesses / self.lengths**2).sum())
+
+    @cached_property
     def angle_limits(self) -> np.ndarray:
         """Least and greatest motor angles, shape (n, 2) [rad]."""
         return read_only(np.array([rod.angle_limits for rod in self.rods]))
