@@ -35,6 +35,7 @@ def frame(axes: Any, shapes: np.ndarray, margin: float = 0.03) -> None:
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal")
+    axes.locator_params(nbins=6)  # or the numbers run into each other
 
 
 def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
@@ -165,7 +166,7 @@ def plot_times(axes: Any, samples: dict[str, tuple[np.ndarray, str]], budgets: d
     for name, (budget, colour) in budgets.items():
         axes.axvline(budget, color=colour, ls="--", label=f"budget of the {name}")
     axes.set(xscale="log", xlabel="wall time [us]", ylabel="share of steps [%]", title="Step times")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, fontsize=8)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=8)
 
 
 def animate_run(run: Run, path: Path, progress: bool = False) -> None:
