@@ -180,14 +180,15 @@ def load_scene(path: str | Path) -> Scene:
     ------
     ModelError
         A key is missing, misspelt, of the wrong type or out of range, in the scene or in its robot; the motors start
-        beyond a stop; or a rod is too short for the start or for the reference. What takes statics to see is seen at
-        the start of a run, or by `check_scene`.
+        beyond a stop; a rod is too short for the start or for the reference; or the scene's own limit on torque is too
+        low for the start. What else takes statics to see is seen at the start of a run, or by `check_scene`.
     """
     with read_toml(path) as file:
         name = file.text("name")
         robot = load_robot(file.path.parent / file.text("robot"))
         duration = file.number("duration", above=0.0)
         with file.table("limits", {}) as limits:
+            own_torque = limits.has("torque")
             robot = replace(
                 robot,
                 rate_limit=limits.number("rate", robot.rate_limit, above=0.0),
@@ -245,6 +246,8 @@ def load_scene(path: str | Path) -> Scene:
     try:
         _require_within_stops(scene)
         _require_reach(scene)
+        if own_torque:
+            scene.start()
     except ModelError as error:
         raise ModelError(f"{path}: {error}", file=str(path), **error.details) from None
     return scene if scene.tuning is None else scene.tuned(scene.tuning)
