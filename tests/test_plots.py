@@ -75,7 +75,8 @@ def test_the_axis_of_an_error_begins_where_the_error_does(kept):
     plots.plot_error(axes, t, np.zeros_like(t))  # nothing to draw on a logarithmic axis, and no error
 
 
-def test_legends_and_texts_of_a_run_cover_nothing(kept, run, tmp_path):
+def test_legends_of_a_run_cover_nothing_and_a_motor_has_one_name(kept, run, tmp_path):
+    run.save(tmp_path)
     plots.plot_run(run, tmp_path / "run.png")
     (figure,) = kept
     figure.canvas.draw()
@@ -87,12 +88,7 @@ def test_legends_and_texts_of_a_run_cover_nothing(kept, run, tmp_path):
         assert not box.overlaps(axes.xaxis.label.get_window_extent())
         boxes.append(box)
     assert not boxes[1].overlaps(boxes[2])
-
-
-def test_a_motor_has_one_name(kept, run, tmp_path):
-    run.save(tmp_path)
-    plots.plot_run(run, tmp_path / "run.png")
-    names = [text.get_text() for text in kept[0].axes[2].get_legend().get_texts()]
+    names = [text.get_text() for text in inputs.get_legend().get_texts()]
     assert names[:2] == ["motor 0 (q0)", "motor 1 (q1)"]
     header = (tmp_path / "run.csv").read_text().splitlines()[0].split(",")
     assert {"q0_rad", "q1_rad", "u0_rad_s", "u1_applied_rad_s", "torque1_Nm"} <= set(header)
