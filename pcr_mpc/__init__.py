@@ -17,7 +17,8 @@ from .errors import (
 from .linearisation.linear_model import LinearModel
 from .linearisation.linearise import linearise
 from .loop.controllers import HoldMotors
-from .loop.run import Run
+from .loop.feasibility import check_scene
+from .loop.run import Run, load_run
 from .loop.scene import Scene, load_scene
 from .loop.simulate import simulate
 from .loop.tracking import TrackingController, make_controller
@@ -58,11 +59,13 @@ __all__ = [
     "all_equilibria",
     "assess_stability",
     "build_qp",
+    "check_scene",
     "distance_to_fold",
     "forward_statics",
     "inverse_statics",
     "linearise",
     "load_robot",
+    "load_run",
     "load_scene",
     "load_tuning",
     "make_controller",

@@ -7,6 +7,7 @@ import json
 import re
 import sys
 import traceback
+import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    warnings.formatwarning = lambda message, *_, **__: f"pcr-mpc: warning: {message}\n"
     try:
         status: int = options.run(options)
         return status

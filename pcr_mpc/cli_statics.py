@@ -11,7 +11,7 @@ from pathlib import Path
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
 from .plant.mjcf import mjcf
-from .plant.robot import load_robot
+from .plant.robot import Robot, load_robot
 from .plant.stability import all_equilibria, assess_stability
 from .plant.statics import solve_statics
 from .report.plots import plot_equilibria, plot_equilibrium
@@ -31,6 +31,8 @@ def solve_pose(options: argparse.Namespace) -> int:
     force = options.force or (0.0, 0.0)
     if q is not None and options.degrees:
         q = [math.radians(angle) for angle in q]
+    if q is not None:
+        _question_angles(robot, q, "" if options.degrees else ", or add --degrees if these are degrees")
     if options.p is not None and q is not None:
         eq = solve_statics(robot, options.p, q, method=options.method or "closed_form")
     elif options.p is not None:
@@ -45,6 +47,16 @@ def solve_pose(options: argparse.Namespace) -> int:
     if options.picture:
         plot_equilibrium(eq, options.picture)
     return 0
+
+
+def _question_angles(robot: Robot, q: list[float], advice: str) -> None:
+    """Refuse angles that are more than a turn beyond the motors' stops."""
+    for i, (angle, (lower, upper)) in enumerate(zip(q, robot.angle_limits, strict=False)):
+        if not lower - 2 * math.pi <= angle <= upper + 2 * math.pi:
+            raise ValueError(
+                f"--q {angle:g} rad is more than a turn beyond the stops of motor {i}, [{lower:g}, {upper:g}] rad; "
+                f"take off the whole turns{advice}"
+            )
 
 
 def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:

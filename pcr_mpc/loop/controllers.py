@@ -24,11 +24,17 @@ class Decision:
         Certificate of the decision.
     linearise_time : float
         [s].
+    estimate : ndarray, shape (4 + n,), or None
+        Of the state at the measurement, which the decision rests on.
+    force : ndarray, shape (2,), or None
+        Unknown force on the tip, as estimated [N].
     """
 
     u: np.ndarray
     plan: Plan | None = None
     linearise_time: float = 0.0
+    estimate: np.ndarray | None = None
+    force: np.ndarray | None = None
 
 
 class Controller(Protocol):

@@ -13,6 +13,7 @@ from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import inverse_statics
 from ..plant.robot import Robot
+from ..plant.stability import least_rod_margin
 from .scene import Scene
 
 # The motor angles' change by the rods' inertia is found again from the angles that it leads to, until it settles [rad]:
@@ -34,9 +35,21 @@ class InverseDynamics(Frozen, Reference):
         That the rods carry [N].
     angles_per_force : ndarray, shape (K, n, 2)
         Least change of the motor angles by which they carry one more newton [rad/N].
+    torques : ndarray, shape (K, n)
+        Of the motors [N m].
+    torques_per_force : ndarray, shape (K, n, 2)
+        Their change by that of the angles [N m/N].
+    stiffness : ndarray, shape (K,)
+        Least eigenvalue of K [N/m].
+    rod_margin : ndarray, shape (K,)
+        Least of the rods (see `least_rod_margin`).
     """
 
     angles_per_force: np.ndarray
+    torques: np.ndarray
+    torques_per_force: np.ndarray
+    stiffness: np.ndarray
+    rod_margin: np.ndarray
 
 
 def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, inertia: str = "none") -> InverseDynamics:
@@ -77,14 +90,16 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     # Mass and weight of what is carried, which has nothing to do with the rods.
     loads = carried[:, None] * (np.array(robot.gravity) - a)
     forces = loads - robot.tip_mass * a - robot.drag * v
-    q, levers = _angles(robot, pose, t, p, forces)
+    poses = _poses(robot, pose, t, p, forces)
+    q = np.stack([eq.q for eq in poses])
     if inertia != "none":
         plant = Plant(robot, inertia=inertia)
         for _ in range(_MOST_SWEEPS):
             plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
             momentum, push, own = _momentum(plant, carried, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
             forces = loads + push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
-            before, (q, levers) = q, _angles(robot, pose, t, p, forces)
+            poses = _poses(robot, pose, t, p, forces)
+            before, q = q, np.stack([eq.q for eq in poses])
             change = float(np.abs(q - before).max())
             if change < _SETTLED:
                 break
@@ -99,23 +114,29 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
             )
         v = own
     rates = np.diff(q, axis=0) / scene.period
-    return InverseDynamics(np.hstack([p, v, q]), rates, forces, angles_per_force=levers)
+    levers = np.stack([np.linalg.pinv(eq.dforce_dq) for eq in poses])
+    return InverseDynamics(
+        np.hstack([p, v, q]),
+        rates,
+        forces,
+        angles_per_force=levers,
+        torques=np.stack([eq.motor_torque for eq in poses]),
+        torques_per_force=np.stack([eq.dtorque_dq for eq in poses])[:, :, None] * levers,
+        stiffness=np.array([eq.stiffness_eigenvalues[0] for eq in poses]),
+        rod_margin=np.array([least_rod_margin(eq) for eq in poses]),
+    )
 
 
-def _angles(
-    robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Motor angles at which the rods carry the forces at the tips p, (K, n) [rad], and their change by one more newton,
-    (K, n, 2) [rad/N]."""
-    angles, levers, eq = np.empty((len(t), robot.n_rods)), np.empty((len(t), robot.n_rods, 2)), pose
+def _poses(robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray) -> list[Equilibrium]:
+    """Poses at which the rods carry the forces at the tips p."""
+    poses, eq = [], pose
     for k in range(len(t)):
         try:
             eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
             raise type(error)(f"reference at t = {t[k]:.3f} s: {error}", **error.details) from None
-        angles[k] = eq.q
-        levers[k] = np.linalg.pinv(eq.dforce_dq)
-    return angles, levers
+        poses.append(eq)
+    return poses
 
 
 def _momentum(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..control.tuning import Tuning, load_tuning
-from ..errors import ModelError
+from ..errors import ModelError, UnreachableError
 from ..linearisation.pose_limits import PoseLimits
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
@@ -126,15 +126,36 @@ class Scene:
             )
         return replace(self, tuning=tuning, period=period, own_period=own if tuning.period else None)
 
+    @property
+    def torque_limit(self) -> float:
+        """Of the motors, or of the poses if that is less [N m]."""
+        return min(self.robot.torque_limit, self.pose_limits.torque or math.inf)
+
     def start(self) -> Equilibrium:
         """Solve for the pose in which the robot starts, in balance without load.
 
         Raises
         ------
         ModelError
-            The free tip at ``start_motors`` is not where the reference begins.
+            The free tip at ``start_motors`` is not where the reference begins, these are beyond a stop, or to hold
+            the start takes more torque than the motors have.
         """
+        eq = self._start()
+        i = int(np.abs(eq.motor_torque).argmax())
+        torque = float(eq.motor_torque[i])
+        if abs(torque) > self.torque_limit:
+            raise ModelError(
+                f"{self.name}: to rest at the start, p = {eq.p} m, q = {eq.q} rad, takes {torque:.4g} N m of motor "
+                f"{i}, which has {self.torque_limit:.4g} N m; give the motors more torque, or start from another pose",
+                key="torque",
+                torque=torque,
+                limit=self.torque_limit,
+            )
+        return eq
+
+    def _start(self) -> Equilibrium:
         if self.start_motors is not None:
+            _require_within_stops(self)
             eq = forward_statics(self.robot, self.start_motors)
             if self.trajectory is not None:
                 begin = self.trajectory(np.zeros(1))[0, 0]
@@ -158,13 +179,16 @@ def load_scene(path: str | Path) -> Scene:
     Raises
     ------
     ModelError
-        A key is missing, misspelt, of the wrong type or out of range, in the scene or in its robot.
+        A key is missing, misspelt, of the wrong type or out of range, in the scene or in its robot; the motors start
+        beyond a stop; a rod is too short for the start or for the reference; or the scene's own limit on torque is too
+        low for the start. What else takes statics to see is seen at the start of a run, or by `check_scene`.
     """
     with read_toml(path) as file:
         name = file.text("name")
         robot = load_robot(file.path.parent / file.text("robot"))
         duration = file.number("duration", above=0.0)
         with file.table("limits", {}) as limits:
+            own_torque = limits.has("torque")
             robot = replace(
                 robot,
                 rate_limit=limits.number("rate", robot.rate_limit, above=0.0),
@@ -219,7 +243,44 @@ def load_scene(path: str | Path) -> Scene:
                 file=str(path),
                 key="start.tip",
             )
+    try:
+        _require_within_stops(scene)
+        _require_reach(scene)
+        if own_torque:
+            scene.start()
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}", file=str(path), **error.details) from None
     return scene if scene.tuning is None else scene.tuned(scene.tuning)
+
+
+def _require_within_stops(scene: Scene) -> None:
+    for i, angle in enumerate(scene.start_motors or ()):
+        lower, upper = scene.robot.angle_limits[i]
+        if not lower <= angle <= upper:
+            raise ModelError(
+                f"{scene.name}: start.motors: motor {i} is to start at {angle:g} rad, beyond its stops, "
+                f"[{lower:g}, {upper:g}] rad; start within them",
+                key="start.motors",
+            )
+
+
+def _require_reach(scene: Scene) -> None:
+    """Raise if a rod is too short for the start or for the reference, which costs no statics to see."""
+    if scene.start_tip is not None:
+        try:
+            scene.robot.require_reachable(np.array(scene.start_tip))
+        except UnreachableError as error:
+            raise ModelError(f"{scene.name}: start.tip: {error}", key="start.tip", **error.details) from None
+    if scene.trajectory is None:
+        return
+    t = scene.period * np.arange(scene.n_periods + 1)
+    for at, tip in zip(t, scene.trajectory(t)[:, 0], strict=True):
+        try:
+            scene.robot.require_reachable(tip)
+        except UnreachableError as error:
+            raise ModelError(
+                f"{scene.name}: reference at t = {at:.3f} s: {error}", key="reference", t=float(at), **error.details
+            ) from None
 
 
 def _pose_limits(table: Table, robot: Robot) -> PoseLimits:

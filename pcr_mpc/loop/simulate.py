@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -11,8 +12,13 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from ..control.tuning import Tuning
 from ..errors import SimulationError
+from ..plant.robot import Robot
 from .controllers import Controller
+from .feasibility import reference_excess
+from .feed_forward import InverseDynamics
+from .record import versions
 from .run import Run
 from .scene import Scene
 from .simulated_plant import SimulatedPlant
@@ -39,17 +45,20 @@ def simulate(
     seed : int
         Of the measurement noise.
     spent : callable, optional
-        (period, measured seconds) -> seconds that the decision is taken to have cost, where the scene has a deadline.
-        None: what was measured (then the run is not repeatable).
+        (period, measured seconds) -> seconds that the decision is taken to have cost, against the scene's deadline
+        and the control period. None: what was measured (then the run is not repeatable).
     progress : bool
-        Show a progress bar on stderr.
+        Show a progress bar on stderr, and before it what the reference asks for and the robot cannot do.
 
     Returns
     -------
     Run
+        Its events begin with what the reference asks for in vain, where the controller knows its inverse dynamics.
 
     Raises
     ------
+    ModelError
+        The start cannot be held (see `Scene.start`).
     SimulationError
         The plant or the controller failed, or the run was interrupted; its ``run`` holds everything until
         then, and its ``__cause__`` is the failure.
@@ -71,10 +80,20 @@ def simulate(
     inputs = np.empty((n_periods, n))
     plant_time = np.empty(n_periods * per)
     control_time = np.zeros((n_periods, 6))
+    costs = np.zeros(n_periods)
+    measurements, estimates = np.empty((n_periods, len(x))), np.full((n_periods, len(x)), np.nan)
+    forces, applied = np.full((n_periods, 2), np.nan), np.empty((n_periods * per, n))
     iterations = np.zeros(n_periods, dtype=int)
     active: Counter[str] = Counter()
     slack: dict[str, float] = {}
     events: list[dict[str, Any]] = []
+    # What only some controllers know of themselves.
+    asked, tuning, believed = (getattr(controller, name, None) for name in ("reference", "tuning", "robot"))
+    if isinstance(asked, InverseDynamics):
+        for line in reference_excess(scene, asked):
+            events.append({"t": 0.0, "kind": "warning", "message": line})
+            if progress:
+                print(f"{scene.name}: warning: {line}", file=sys.stderr)
     states[0] = x
     done, decided, snapped = 0, 0, 0
     meanwhile = np.zeros(n)
@@ -104,6 +123,14 @@ def simulate(
             rungs=plant.rungs,
             events=events,
             rung=scene.plant if scene.plant.describes(plant, scene.robot) else None,
+            measured=measurements[:decided].copy(),
+            estimate=estimates[:decided].copy(),
+            estimated_force=forces[:decided].copy(),
+            applied=applied[:done].copy(),
+            decision_time=costs[:decided].copy(),
+            tuning=tuning if isinstance(tuning, Tuning) else None,
+            believed=believed if isinstance(believed, Robot) else None,
+            versions=versions(),
         )
 
     try:
@@ -113,13 +140,19 @@ def simulate(
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
             if scene.angle_step:
                 measured[4:] = scene.angle_step * np.round(measured[4:] / scene.angle_step)
+            measurements[k] = measured
             began, began_cpu = time.perf_counter(), time.thread_time()
             decision = controller.step(k, measured)
             control_time[k, 0] = time.perf_counter() - began
             control_time[k, 5] = time.thread_time() - began_cpu
             inputs[k] = decision.u
-            decided = k + 1
+            if decision.estimate is not None:
+                estimates[k] = decision.estimate
+            if decision.force is not None:
+                forces[k] = decision.force
             cost = float(control_time[k, 0]) if spent is None else spent(k, float(control_time[k, 0]))
+            costs[k] = cost
+            decided = k + 1
             late = 0
             if cost > scene.deadline:
                 late = min(per, math.ceil(cost / plant.dt))
@@ -149,6 +182,7 @@ def simulate(
                 u = meanwhile if j < waiting else arrived
                 if done in changes:
                     x = plant.carry(float(payloads[done]), x)
+                applied[done] = u
                 began = time.perf_counter()
                 x = plant.step(x, u, scene.force)
                 plant_time[done] = time.perf_counter() - began

@@ -76,6 +76,11 @@ class TrackingController(Remade):
         self._inverse = MotorTarget(self.robot)
         self._law: Law | None = None
 
+    @property
+    def reference(self) -> InverseDynamics:
+        """Inverse dynamics of the scene's reference, from `start` on."""
+        return self._reference
+
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
         self._pose = pose
@@ -184,6 +189,7 @@ class TrackingController(Remade):
             if all(map(math.isfinite, x[:2].tolist() + x[4:].tolist())):
                 observer.correct(x[:2], x[4:])
             x, force = observer.x, observer.force
+        estimate = x
         began = time.perf_counter()
         failure, now, ahead = "", None, x
         models: LinearModel | list[LinearModel] | None = None
@@ -219,7 +225,7 @@ class TrackingController(Remade):
         if observer is not None:
             observer.predict(self._predicts, arriving)
         self._seen = x, arriving
-        return Decision(plan.inputs[0], plan, linearised)
+        return Decision(plan.inputs[0], plan, linearised, estimate, force)
 
     def _linearise(self, x: np.ndarray, k: int, force: np.ndarray) -> LinearModel | list[LinearModel]:
         here = self._model_at(k + self._delay, x, self._u, force)

@@ -84,7 +84,9 @@ def inverse_statics(
 ) -> Equilibrium:
     """Motor angles that hold the tip at p while the rods carry a given force.
 
-    With more than two rods the angles are not unique: those nearest to the guess are taken.
+    With more than two rods the angles are not unique: those nearest to the guess are taken. Nor are whole turns, which
+    no rod feels: a guess keeps its own; a search takes, of the turns between the stops, the one that leaves the motor
+    nearest to the direction of the rod's chord, from -pi to pi.
 
     Parameters
     ----------
@@ -126,6 +128,10 @@ def inverse_statics(
         try:
             solver.start(p, q)
             eq = solver.equilibrium(p, _turn(solver, p, q, force))
+            unwound = _unwound(robot, p, eq.q)
+            if (unwound != eq.q).any():
+                solver.start(p, unwound)
+                eq = solver.equilibrium(p, unwound)
         except PCRError:
             continue
         lower, upper = robot.angle_limits.T
@@ -347,8 +353,9 @@ def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | No
     for i, rod in enumerate(robot.rods):
         dx, dy = (p - rod.base) / rod.length
         lower, upper = rod.angle_limits
-        angles = lower + (np.arctan2(dy, dx) + offsets - lower) % (2 * np.pi)
-        angles = angles[angles <= upper]
+        chord = np.arctan2(dy, dx)
+        angles = lower + (chord + offsets - lower) % (2 * np.pi)
+        angles = _nearest_turn(angles[angles <= upper], chord, lower, upper)
         if len(angles) < _NARROW:
             angles = np.linspace(lower, upper, _NARROW)
         unit = rod.bending_stiffness / rod.length**2 / scale
@@ -365,6 +372,20 @@ def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | No
     best = np.argsort(np.hypot(*scores.T[:2]) + 0.02 * scores[:, 2], kind="stable")[:_CANDIDATES]
     chosen = np.unravel_index(best, [len(angles) for angles in per_rod])
     return list(np.stack([angles[at] for angles, at in zip(per_rod, chosen, strict=True)], axis=1))
+
+
+def _unwound(robot: Robot, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Motor angles of the same shapes, each on the turn that is nearest to its rod's chord and between the stops."""
+    chords = np.arctan2(*(p - robot.bases).T[::-1])
+    return _nearest_turn(q, chords, *robot.angle_limits.T)
+
+
+def _nearest_turn(angles: np.ndarray, wanted: Any, lower: Any, upper: Any) -> np.ndarray:
+    """Add the whole turns by which angles come nearest to what is wanted and stay within limits, if they can."""
+    turn = 2 * np.pi
+    least, most = np.ceil((lower - angles) / turn), np.floor((upper - angles) / turn)
+    turns = np.minimum(np.maximum(np.round((wanted - angles) / turn), least), most)
+    return np.asarray(np.where(least <= most, angles + turn * turns, angles))
 
 
 def _force_scale(robot: Robot) -> float:

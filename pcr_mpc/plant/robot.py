@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +36,8 @@ _ROBOT_NUMBERS = {
 _LEAST_SLACK = 1e-9
 # Beyond it the rounding of an angle, 1e-10 rad, shows in the shape of a rod [rad].
 _LARGEST_ANGLE = 1e6
+# Angles beyond four turns are rather degrees [rad].
+_MANY_TURNS = 8.0 * math.pi
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class Rod:
     line_density : float
         Mass per length [kg/m]; the massless model of the paper does not use it.
     angle_limits : (float, float)
-        Least and greatest motor angle [rad].
+        Least and greatest motor angle [rad]; refused where they hold no angle within four turns of zero.
     curvature : float or tuple of float
         kappa0 at rest [1/m], positive to the left: one number, or values at equally spaced s from base to tip, linear
         in between.
@@ -84,6 +87,11 @@ class Rod:
         lower, upper = self.angle_limits
         if lower >= upper:
             raise ModelError(f"angle_limits: lower {lower} is not below upper {upper}", key="angle_limits")
+        if lower > _MANY_TURNS or upper < -_MANY_TURNS:
+            raise ModelError(
+                f"angle_limits: {_doubtful_limits(self)}; take off the whole turns, or write radians",
+                key="angle_limits",
+            )
 
     @property
     def curvatures(self) -> tuple[float, ...]:
@@ -186,6 +194,11 @@ class Robot(Frozen):
         return read_only(np.array([rod.bending_stiffness for rod in self.rods]))
 
     @cached_property
+    def force_scale(self) -> float:
+        """Sum of EI/L^2, the size of the rods' forces [N]."""
+        return float((self.stiffnesses / self.lengths**2).sum())
+
+    @cached_property
     def angle_limits(self) -> np.ndarray:
         """Least and greatest motor angles, shape (n, 2) [rad]."""
         return read_only(np.array([rod.angle_limits for rod in self.rods]))
@@ -233,6 +246,15 @@ class Robot(Frozen):
                 )
 
 
+def _doubtful_limits(rod: Rod) -> str:
+    low, high = rod.angle_limits
+    degrees = [math.radians(angle) for angle in rod.angle_limits]
+    return (
+        f"[{low:g}, {high:g}] rad reach {max(-low, high) / (2 * math.pi):.3g} turns from zero; if these are degrees, "
+        f"they are [{degrees[0]:.4g}, {degrees[1]:.4g}] rad"
+    )
+
+
 def _check_profile(rod: Rod, key: str, *, minimum: float, maximum: float) -> None:
     """Replace a property along the rod by a tuple of floats, or by a float if it is one number."""
     value = getattr(rod, key)
@@ -264,10 +286,15 @@ def load_robot(path: str | Path) -> Robot:
     ------
     ModelError
         A key is missing, misspelt, of the wrong type or out of range.
+
+    Warns
+    -----
+    UserWarning
+        A motor may turn more than four turns from zero: its limits look like degrees.
     """
     with read_toml(path) as file:
         name = file.text("name")
-        rods = []
+        rods: list[Rod] = []
         for table in file.tables("rods"):
             with table:
                 rods.append(
@@ -282,6 +309,8 @@ def load_robot(path: str | Path) -> Robot:
                         axial_stiffness=table.number("axial_stiffness", math.inf),
                     )
                 )
+            if max(map(abs, rods[-1].angle_limits)) > _MANY_TURNS:
+                warnings.warn(f"{path}: rods.angle_limits: {_doubtful_limits(rods[-1])}", stacklevel=2)
         with file.table("world", {}) as world:
             gravity = world.vector("gravity", 2, (0.0, 0.0))
         with file.table("tip") as tip, file.table("motors") as motors:

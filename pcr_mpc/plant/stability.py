@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import ConvergenceError, PCRError, checked_vector
 from ..frozen import Frozen
 from . import elastica
-from .chart import HeldShape, critical_load, stable_shapes
+from .chart import LEAST_CRITICAL_LOAD, HeldShape, critical_load, stable_shapes
 from .equilibrium import Equilibrium
 from .free_tip import free_solver, settle
 from .multiple_shooting import rod_newton
@@ -22,6 +22,7 @@ from .rod_physics import require_plain
 from .rod_solver import RodSolver
 
 _MAX_ITERATIONS = 40
+_NEAR = 0.3  # margin of a rod below which it is computed exactly
 _RESOLVED = 1e-5  # residual and drift at which the sweep is trusted
 
 
@@ -74,6 +75,23 @@ def assess_stability(eq: Equilibrium) -> Stability:
         stiffness_eigenvalues=eq.stiffness_eigenvalues,
         motor_authority=float(np.linalg.svd(eq.dforce_dq, compute_uv=False)[-1]),
     )
+
+
+def least_rod_margin(eq: Equilibrium) -> float:
+    """Least 1 - lambda / lambda_c of the rods, exact below 0.3, above that at least so much; NaN if they are not plain.
+
+    Cheaper than `assess_stability`, where many poses are gone through.
+    """
+    if eq.robot.needs_shooting is not None:
+        return float("nan")
+    margins = []
+    for nodes in eq.nodes:
+        bound = 1.0 - float(np.sqrt(np.hypot(*nodes[1:3, 0]))) / LEAST_CRITICAL_LOAD
+        if bound < _NEAR:
+            log_tip_angle, load, _ = elastica.from_nodes(nodes)
+            bound = 1.0 - load / critical_load(log_tip_angle)
+        margins.append(bound)
+    return min(margins)
 
 
 def count_conjugate_points(eq: Equilibrium, segments: int = 16) -> int:
