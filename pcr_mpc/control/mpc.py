@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 
@@ -38,12 +39,12 @@ class LinearMPC:
         self._terminal_weight: np.ndarray | None = None
         self._gain: np.ndarray | None = None
         self._last: Plan | None = None
-        self._age = 0  # periods since the last plan was solved
+        self._age = math.inf  # periods since a plan was solved
 
     def reset(self) -> None:
         """Start afresh: the same calls then give the same plans, bit for bit."""
-        self._last, self._age = None, 0
-        self._terminal_weight = None
+        self._last, self._age = None, math.inf
+        self._gain, self._terminal_weight = None, None
         if self._workspace is not None:
             self._workspace.reset()
 
