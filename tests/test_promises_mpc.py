@@ -59,7 +59,6 @@ def off(target, tip=(0.02, -0.03)):
 
 
 def keep_below(p_high):
-    """The tip may not come above p_high."""
     return LinearLimits(
         ("tip region",), np.eye(1, 6, 1) / 0.4, np.array([-np.inf]), np.array([p_high / 0.4]), np.array([0.4])
     )
