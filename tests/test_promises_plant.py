@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import ConvergenceError, Equilibrium, Plant, Robot, rollout
+from pcr_mpc import ConvergenceError, Equilibrium, ModelError, Plant, Robot, rollout
 
 REST = np.zeros(2)
 
@@ -215,3 +215,16 @@ def test_condensed_weight_adds_its_potential_to_force_and_derivatives(heavy, sag
     weightless = Plant(heavy, weight="none")
     weightless.reset(np.concatenate([sagging.p, REST, q]))
     assert abs(force[1] - weightless.force(sagging.p, q)[1]) > 1e-3
+
+
+def test_what_a_kind_of_rods_cannot_do_is_said_of_the_robot(pair, general):
+    bowed = replace(pair, rods=(replace(pair.rods[0], curvature=0.1), pair.rods[1]))
+    with pytest.raises(ModelError, match=r"on_snap='jump' is for uniform, .* is curved at rest"):
+        Plant(bowed, on_snap="jump")
+    with pytest.raises(ModelError, match=r"'closed_form' is for uniform"):
+        Plant(bowed, method="closed_form")
+    with pytest.raises(ModelError, match="for rods that do not stretch"):
+        Plant(general, inertia="full", integrator="gauss")
+    odd = replace(pair.rods[0], curvature=(0.1,) * 60 + (0.2,), stiffness_factors=(1.0,) * 46 + (0.9,))
+    with pytest.raises(ModelError, match=r"lists of \[\d+, 47, 61\] values .* give lists of equal length"):
+        Plant(replace(pair, rods=(odd, pair.rods[1])))
