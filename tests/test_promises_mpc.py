@@ -64,9 +64,6 @@ def keep_below(p_high):
     )
 
 
-# What a reset forgets
-
-
 def test_a_reset_forgets_the_terminal_weight(tuning, target, model, slow, reference, wide):
     used, fresh = LinearMPC(tuning, wide), LinearMPC(tuning, wide)
     kept = used.solve(off(target), slow, reference, NONE), used.solve(off(target), model, reference, NONE)
