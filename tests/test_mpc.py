@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import InfeasibleError, LinearMPC, Plant, Reference, linearise, load_tuning
+from pcr_mpc.control.mpc import riccati
 from pcr_mpc.control.tuning import Limits
 
 from .conftest import CONTROLLERS
@@ -99,7 +100,17 @@ def test_a_tight_angle_limit_is_solved_not_fallen_back_from(tuning, target, mode
 def test_any_horizon(tuning, target, model, pair, horizon):
     reference = Reference(np.tile(target, (horizon, 1)), np.zeros((horizon, 2)))
     mpc = LinearMPC(replace(tuning, horizon=horizon), Limits(6.0, 3.0, *pair.angle_limits.T))
-    assert mpc.solve(far(target), model, reference, np.zeros(2)).inputs.shape == (horizon, 2)
+    plan = mpc.solve(far(target), model, reference, np.zeros(2))
+    assert (plan.status, plan.inputs.shape) == ("solved", (horizon, 2))
+    # Its terminal weight being the cost-to-go, a plan without active limits is the LQR's, however long.
+    free = LinearMPC(
+        replace(tuning, horizon=horizon, tolerance=1e-9), Limits(1e4, 1e4, *np.array([[-1e3] * 2, [1e3] * 2]))
+    )
+    balanced = replace(model, c=target - model.A @ target)
+    gain, _ = riccati(model, tuning)
+    x = target + 1e-3 * np.array([1.0, -2.0, 3.0, 1.0, 0.5, -0.5])
+    planned = free.solve(x, balanced, reference, np.zeros(2)).inputs[0]
+    assert planned == pytest.approx(-gain @ (x - target), rel=1e-2, abs=1e-3)
 
 
 def test_another_period_is_refused(tuning, target, model, reference, pair):

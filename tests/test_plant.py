@@ -186,6 +186,16 @@ def test_three_rods_move():
     plant = Plant(robot, integrator="velocity_verlet", dt=1e-3)
     x = np.concatenate([pose.p, [0.05, 0.0], pose.q])
     plant.reset(x, pose)
+    eq = plant.equilibrium(x)
+    work = 0.0
+    start = robot.tip_mass * x[2:4] @ x[2:4] / 2 + eq.energy
+    u = np.array([0.1, 0.0, -0.1])
     for _ in range(50):
-        x = plant.step(x, (0.1, 0.0, -0.1))
-    assert np.linalg.norm(x[:2] - pose.p) < 0.02
+        before = eq.motor_torque @ u - robot.drag * x[2:4] @ x[2:4]
+        x = plant.step(x, u)
+        eq = plant.equilibrium(x)
+        work += 1e-3 * (before + eq.motor_torque @ u - robot.drag * x[2:4] @ x[2:4]) / 2
+    assert x[4:] == pytest.approx(pose.q + 0.05 * u, abs=1e-12)
+    assert np.linalg.norm(x[:2] - pose.p) > 1e-4  # it does move
+    # What the motors and the drag did to it is what it has: kinetic and elastic energy.
+    assert robot.tip_mass * x[2:4] @ x[2:4] / 2 + eq.energy - start == pytest.approx(work, rel=1e-2, abs=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -54,19 +55,19 @@ class LinearMPC:
         self._terminal_weight: np.ndarray | None = None
         self._gain: np.ndarray | None = None
         self._last: Plan | None = None
-        self._age = 0  # periods since the last plan was solved
+        self._age = math.inf  # periods since a plan was solved
         self._prepared: tuple[LinearModel, Sequence[tuple[str, ...]]] | None = None
         self._first: LinearModel | None = None  # whose terminal weight it is, if nobody called prepare
         self._problem: tuple[Limits, float, float] | None = None  # limits and sizes of the last problem
 
     def reset(self) -> None:
         """Start afresh: the same calls then give the same plans, bit for bit."""
-        self._terminal_weight = self._first = self._prepared = None
+        self._gain = self._terminal_weight = self._first = self._prepared = None
         self._forget()
 
     def _forget(self) -> None:
         """Forget the last plan and its problem."""
-        self._last, self._age, self._problem = None, 0, None
+        self._last, self._age, self._problem = None, math.inf, None
         if self._workspace is not None:
             self._workspace.reset()
 

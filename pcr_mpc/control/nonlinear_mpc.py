@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -74,7 +75,7 @@ class NonlinearMPC:
     def reset(self) -> None:
         """Start afresh: the same calls then give the same plans."""
         self._last: Plan | None = None
-        self._age = 0  # periods since the last plan was solved
+        self._age = math.inf  # periods since a plan was solved
         self._point: Point | None = None
         self._terminal_weight = None
         self._prepared: LinearModel | None = None

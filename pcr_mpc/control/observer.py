@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import control
 import numpy as np
 
+from ..errors import checked_number
 from ..linearisation.linear_model import LinearModel
 
 
@@ -27,6 +28,10 @@ class ObserverTuning:
     tip_noise: float = 1e-5
     force_noise: float = 0.01
     force_walk: float = 0.005
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            checked_number(field.name, getattr(self, field.name), above=0.0)
 
 
 class DisturbanceObserver:

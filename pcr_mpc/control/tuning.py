@@ -47,6 +47,13 @@ class Model:
     payload: bool = True
     predict_delay: bool = True
 
+    def __post_init__(self) -> None:
+        for name, choices in (
+            ("method", METHODS), ("scheme", SCHEMES), ("inertia", INERTIAS), ("linearise", LINEARISE)
+        ):  # fmt: skip
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, expected one of {', '.join(choices)}")
+
 
 @dataclass(frozen=True)
 class Tuning:
@@ -102,6 +109,10 @@ class Tuning:
             checked_number(name, getattr(self, name), above=0.0)
         for name in ("velocity_weight", "angle_weight"):
             checked_number(name, getattr(self, name), minimum=0.0)
+        for gain in self.pd:
+            checked_number("pd", gain)
+        if self.period is not None:
+            checked_number("period", self.period, above=0.0)
         if self.fallback not in FALLBACKS:
             raise ValueError(f"fallback is {self.fallback!r}, expected one of {', '.join(FALLBACKS)}")
 

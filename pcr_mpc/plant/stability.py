@@ -115,8 +115,9 @@ def count_conjugate_points(eq: Equilibrium, segments: int = 16) -> int:
         residual, _, _, conjugate_points, drift = newton(sampled.ravel(order="F"), pose, *known)[4].full().ravel()
         if not (residual < _RESOLVED and abs(drift) < _RESOLVED):
             raise ConvergenceError(
-                f"a rod is too taut for {segments} segments: its state drifts by {abs(drift):.1e} along the sweep "
-                f"(at most {_RESOLVED:.0e}); use more segments, or assess_stability",
+                f"a rod is too taut for {segments} segments: along the sweep its residual is {residual:.1e} and its "
+                f"state drifts by {abs(drift):.1e} (at most {_RESOLVED:.0e} each); use more segments, or "
+                "assess_stability",
                 residual=residual,
                 iterations=0,
                 last=sampled,
