@@ -45,6 +45,7 @@ class _OneStep(ABC):
     def __init__(self, tuning: Tuning, limits: Limits) -> None:
         self.tuning = tuning
         self.limits = limits
+        self._dt = 1.0  # of any model; until there is one, motors are only brought to rest
 
     def reset(self) -> None:  # noqa: B027  it remembers nothing
         """See `Law`."""
@@ -67,13 +68,13 @@ class _OneStep(ABC):
     ) -> Plan:
         """See `Law`."""
         wanted = self._rates(x, reference)
-        u = self.limits.clipped(self.limits.within_stops(wanted, x[4:], self._dt), u_previous)
+        u = self.limits.kept(wanted, u_previous, x[4:], self._dt)
         active = () if np.array_equal(u, wanted) else self.limits.met_by(u, u_previous)
         return Plan(u[None], None, models, "solved", None, active)
 
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """See `Law`: the motors are brought to rest."""
-        u = self.limits.clipped(np.zeros(len(u_previous)), u_previous)
+        u = self.limits.kept(np.zeros(len(u_previous)), u_previous, x[4:], self._dt)
         return Plan(u[None], None, None, status, "hold")
 
 
@@ -85,7 +86,8 @@ class FeedForward(_OneStep):
 
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """See `Law`: it needs no measurement."""
-        return Plan(self.limits.clipped(reference.inputs[0], u_previous)[None], None, None, "solved")
+        u = self.limits.kept(reference.inputs[0], u_previous, x[4:], self._dt)
+        return Plan(u[None], None, None, "solved")
 
 
 class LQR(_OneStep):
