@@ -18,6 +18,7 @@ from .scene import Scene
 # each time the error falls as the rods' share of the mass, 1/200 of the change on the default robot.
 _SETTLED = 1e-5
 _MOST_SWEEPS = 20
+_STRIDE = 25  # periods from which to which the rods are followed along a reference that was solved before
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -99,6 +100,32 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
         v = own
     rates = np.diff(q, axis=0) / scene.period
     return InverseDynamics(np.hstack([p, v, q]), rates, forces, angles_per_force=levers)
+
+
+def held(
+    reference: InverseDynamics, k: int, robot: Robot, pose: Equilibrium, payload: float, count: int
+) -> InverseDynamics:
+    """The point of the reference in period k, held at rest for ``count`` periods.
+
+    Parameters
+    ----------
+    reference : InverseDynamics
+    k : int
+    robot : Robot
+        As it is believed to be.
+    pose : Equilibrium
+        At the start of the reference; its branch is followed.
+    payload : float
+        That the tip carries [kg].
+    count : int
+    """
+    on_the_way = np.unique([*range(0, k, _STRIDE), k])
+    p = reference.states[[*on_the_way, k], :2]
+    forces = np.vstack([reference.forces[on_the_way], payload * np.array(robot.gravity)])
+    q, levers = _angles(robot, pose, np.full(len(p), np.nan), p, forces)
+    state = np.concatenate([p[-1], np.zeros(2), q[-1]])
+    states, forces, levers = (np.array([one] * (count + 1)) for one in (state, forces[-1], levers[-1]))
+    return InverseDynamics(states, np.zeros((count, robot.n_rods)), forces, angles_per_force=levers)
 
 
 def _angles(

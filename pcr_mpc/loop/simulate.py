@@ -113,6 +113,8 @@ def simulate(
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
             if scene.angle_step:
                 measured[4:] = scene.angle_step * np.round(measured[4:] / scene.angle_step)
+            if scene.wrapped:
+                measured[4:] -= 2 * np.pi * np.ceil(measured[4:] / (2 * np.pi) - 0.5)
             began, began_cpu = time.perf_counter(), time.thread_time()
             decision = controller.step(k, measured)
             control_time[k, 0] = time.perf_counter() - began
@@ -120,6 +122,7 @@ def simulate(
             inputs[k] = decision.u
             decided = k + 1
             cost = float(control_time[k, 0]) if spent is None else spent(k, float(control_time[k, 0]))
+            events += [{"t": k * scene.period, **event} for event in decision.events]
             late = 0
             if cost > scene.deadline:
                 late = min(per, math.ceil(cost / plant.dt))

@@ -21,8 +21,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def summary_table(summary: dict[str, Any]) -> str:
-    """Figures of a run."""
+    """Figures of a run; first of all what is wrong with it."""
     lines = [
+        *([f"FAILED      {summary['verdict']}", ""] if summary["verdict"] else []),
         f"scene       {summary['scene']} ({summary['duration_s']:g} s)",
         f"controller  {summary['controller']}",
         f"plant       {summary['plant']}",
@@ -60,6 +61,7 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"largest slack     {', '.join(f'{k} {v:.3g}' for k, v in summary['slack'].items()) or 'none'}",
         f"limit violations  {summary['limit_violations']}",
         f"fall-backs        {summary['fallbacks']}",
+        f"not believed      {summary['refused_measurements']} measurements",
         f"failures          {summary['failures']}",
     ]
     return "\n".join(lines)
