@@ -88,6 +88,14 @@ def test_readings_that_cannot_be_are_bridged(lemniscate, tunings, name):
     assert not runs[1].events
 
 
+def test_what_just_passes_does_not_shut_the_gate(lemniscate, tunings):
+    """A tip off by 4.5 mm, and an encoder by 0.03 rad, are believed; then so are the sound readings after them."""
+    periods = {60: (0, 0.0045), 75: (4, 0.03)}
+    runs = [run_spoilt(lemniscate, spoil, tunings["default"]) for spoil in (at(periods), at({}))]
+    assert 0.1 < apart_mm(*runs) < 3.0
+    assert runs[0].summary()["refused_measurements"] == 0
+
+
 def test_the_nonlinear_mpc_is_behind_the_gate_too(lemniscate, tunings):
     scene = replace(lemniscate, duration=0.3)
     runs = [run_spoilt(scene, at(periods), tunings["nonlinear"]) for periods in ({20: (0, 0.1)}, {})]

@@ -12,9 +12,12 @@ from ..plant.robot import Robot
 
 Event = dict[str, str]
 
-# How far from where it is expected a tip may be seen, as a fraction of the shortest rod: 10 mm on the default robot.
+# How far from where it is expected a tip may be seen, as a fraction of the shortest rod: 5 mm on the default robot.
 # There, one that swings by 90 mm, stiffnesses off by 40 % and commands two periods late, is seen within 4 mm.
-_SURPRISE = 0.025
+_SURPRISE = 0.0125
+# A surprise that was believed, right or wrong, leads to others, which must be believed too: of the tip to greater ones,
+# for it makes velocity and force wrong, of an angle to the same on the way back.
+_TIP_ECHO, _ANGLE_ECHO = 3.0, 1.0
 _DEVIATIONS = 10.0  # of the sensor's noise, besides
 _TOO_LONG = 0.02  # of a rod's length, by which a tip may seem out of its reach: bases and lengths are not exact
 # A sensor that has said the same for so many periods in a row is right, and the expectation is wrong.
@@ -23,18 +26,20 @@ _TURN = 2 * math.pi
 
 
 class _Sensor:
-    """For how long a sensor has told the same that was not believed."""
+    """For how long a sensor has told the same that was not believed, and how it has surprised lately."""
 
     def __init__(self) -> None:
         self.last: list[float] | None = None
+        self.surprise = 0.0  # of what was believed, halved in every period since
         self._agreeing = 0
 
-    def believed(self) -> None:
+    def believed(self, surprise: float) -> None:
         self.last, self._agreeing = None, 0
+        self.surprise = max(surprise, self.surprise / 2)
 
     def refused(self, reading: list[float], near: float) -> bool:
         """Count a reading that was not believed; return whether it has insisted long enough."""
-        last, self.last = self.last, reading
+        last, self.last, self.surprise = self.last, reading, self.surprise / 2
         # So written that NaN agrees with nothing.
         agrees = last is not None and all(abs(now - then) <= near for now, then in zip(reading, last, strict=True))
         self._agreeing = self._agreeing + 1 if agrees else 1
@@ -110,7 +115,7 @@ class Gate:
             q = q + _TURN * turns
         angles_why, tip_why = self._odd_angles(q, expected[4:]), self._odd_tip(x, expected, with_velocity)
         if angles_why is None:
-            self._encoders.believed()
+            self._encoders.believed(float(np.abs(q - expected[4:]).max()))
             found.q = q
         else:
             text, unit = angles_why
@@ -120,11 +125,11 @@ class Gate:
             if insists and not unit and ((q >= self._lower) & (q <= self._upper)).all():
                 found.q = q
                 found.note("reinitialised", k, f"{text}; told so {PATIENCE} times in a row, and believed now")
-                self._encoders.believed()
+                self._encoders.believed(self._turn)
             else:
                 found.note("measurement", k, f"{text}; bridged by the prediction")
         if tip_why is None:
-            self._tip.believed()
+            self._tip.believed(math.hypot(*(p - expected[:2]).tolist()))
             found.p = p
         else:
             text, unit = tip_why
@@ -135,7 +140,7 @@ class Gate:
             if insists and before is not None and not self._too_far(p, 0.0):
                 found.p, found.velocity = p, (p - np.array(before)) / self._dt
                 found.note("reinitialised", k, f"{text}; told so {PATIENCE} times in a row, and believed now")
-                self._tip.believed()
+                self._tip.believed(self._near)
             else:
                 found.note("measurement", k, f"{text}; bridged by the prediction")
         self._first = False
@@ -146,7 +151,7 @@ class Gate:
         """Why a tip is not to be believed, and whether other units explain it."""
         px, py, vx, vy = x[:4].tolist()
         ex, ey, evx, evy = expected[:4].tolist()
-        near = self._near
+        near = self._near + _TIP_ECHO * self._tip.surprise
         away = math.hypot(px - ex, py - ey)
         # So written that NaN is odd.
         if away <= near and not self._too_far(x[:2], _TOO_LONG):
@@ -176,20 +181,20 @@ class Gate:
 
     def _odd_angles(self, q: np.ndarray, expected: np.ndarray) -> tuple[str, bool] | None:
         """Why motor angles are not to be believed, and whether other units explain them."""
-        measured, before = q.tolist(), self._before.tolist()
+        measured, before, turn = q.tolist(), self._before.tolist(), self._turn + _ANGLE_ECHO * self._encoders.surprise
         # So written that NaN is odd.
-        if all(abs(now - then) <= self._turn for now, then in zip(measured, before, strict=True)):
+        if all(abs(now - then) <= turn for now, then in zip(measured, before, strict=True)):
             return None
         text = f"motor angles {_listed(q)} rad"
         if not np.isfinite(q).all():
             return f"{text} are not finite", False
         text += f", expected {_listed(expected)} rad"
         turns = np.round((q - self._before) / _TURN)
-        if turns.any() and (np.abs(q - _TURN * turns - self._before) <= self._turn).all():
+        if turns.any() and (np.abs(q - _TURN * turns - self._before) <= turn).all():
             return f"{text}: angles jump by 2 pi: encoders that wrap? set [sensor] wrapped = true", True
-        if (np.abs(np.radians(q) - self._before) <= self._turn).all():
+        if (np.abs(np.radians(q) - self._before) <= turn).all():
             return f"{text}: degrees? give radians", True
-        return f"{text}: the motors turn by at most {self._turn:.3g} rad in a period", False
+        return f"{text}: the motors turn by at most {turn:.3g} rad in a period", False
 
 
 class Sifted:
