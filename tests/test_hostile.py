@@ -24,10 +24,10 @@ def narrow():
     scene = load_scene(MODELS / "scenes" / "lemniscate.toml")
     q = inverse_statics(scene.robot, scene.start_tip, mode=scene.start_mode).q
     rods = tuple(
-        replace(rod, angle_limits=(float(angle) - 0.3, float(angle) + 0.2))
+        replace(rod, angle_limits=(float(angle) - 0.12, float(angle) + 0.1))
         for rod, angle in zip(scene.robot.rods, q, strict=True)
     )
-    return replace(scene, duration=0.2, robot=replace(scene.robot, rods=rods, rate_limit=5.0, acceleration_limit=50.0))
+    return replace(scene, duration=0.1, robot=replace(scene.robot, rods=rods, rate_limit=5.0, acceleration_limit=50.0))
 
 
 def hostile(rng, k, x, before):
@@ -90,6 +90,6 @@ def test_the_motors_keep_their_limits(narrow, name, observed):
         nearest = min(nearest, float(np.minimum(q - lower, upper - q).min()))
         x = np.concatenate([pose.p + 0.01 * np.sin([0.2 * k, 0.3 * k]), 0.1 * rng.normal(size=2), q])
     assert refused > 5 or tuning.law == "nonlinear_mpc"
-    # It was about the stops: the motors came close to one. (An open loop goes where it wants to.)
+    # It was about the stops: the motors came closer to one. (An open loop goes where it wants to.)
     if observed and tuning.law not in ("nonlinear_mpc", "feed_forward"):
-        assert nearest < 0.02
+        assert nearest < 0.07
