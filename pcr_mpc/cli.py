@@ -208,6 +208,8 @@ def _track(options: argparse.Namespace) -> int:
     print(json.dumps(summary) if options.json else f"\n{summary_table(summary)}\n\nwritten to {folder}")
     if failure is not None:
         raise failure
+    if run.verdict():
+        raise SimulationError(f"{scene.name}: {run.verdict()}", run=run)
     return 0
 
 

@@ -71,6 +71,10 @@ class ReadOnlyError(PCRError, AttributeError):
     """An attribute that cannot be set was: its name is ``attribute``; the message says what to do instead."""
 
 
+class MeasurementError(PCRError, ValueError):
+    """A controller's first measurement contradicts the pose in which it was started, as other units do."""
+
+
 class CompilerError(PCRError):
     """No machine code could be made of a graph; ``command`` is what was run."""
 
@@ -98,6 +102,34 @@ def checked_vector(name: str, value: Any, size: int) -> np.ndarray:
     if not all(map(math.isfinite, array.tolist())):
         raise ValueError(f"{name} is not finite: {array}")
     return array
+
+
+def measured_vector(name: str, value: Any, size: int) -> np.ndarray:
+    """Return ``value`` as a float64 vector of ``size`` entries, finite or not; a row or a column means the same.
+
+    Raises
+    ------
+    ValueError
+        Names the argument and both shapes, or the entries that are not numbers.
+    """
+    if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == (size,):
+        return value
+    if np.shape(value) in ((size, 1), (1, size)):
+        value = np.reshape(value, size)
+    return _float_array(name, value, (size,))
+
+
+def checked_period(name: str, value: Any) -> int:
+    """Return ``value`` as the number of a control period, or say what it is instead.
+
+    Raises
+    ------
+    ValueError
+        Names the argument and its value.
+    """
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral) or value < 0:
+        raise ValueError(f"{name} = {value!r} must be a whole number, counted from 0")
+    return int(value)
 
 
 def checked_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -193,11 +193,12 @@ def test_the_controller_does_not_drive_through_a_fold(pair):
         force=(5.0, 5.0),
         tuning=load_tuning(CONTROLLERS / "frozen.toml"),
         pose_limits=PoseLimits(),
+        tracking_error=0.3,  # where the branch ends is far from where it should go
     )
     with pytest.raises(SimulationError, match="its branch ends"):
         run(scene)
     found = run(scene, stiffness=20.0, rod_margin=0.1)
-    assert found.summary()["failures"] == 0
+    assert found.verdict() == ""
     plant = Plant(robot)
     plant.reset(found.x[0], found.pose)
     verdicts = [assess_stability(plant.equilibrium(x)) for x in found.x[::10]]

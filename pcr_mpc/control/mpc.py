@@ -175,9 +175,8 @@ class LinearMPC:
             status, fallback = f"cannot keep {', '.join(answer.slack)}", "softened"
         solved = time.perf_counter()
         inputs = answer.inputs.reshape(-1, n)
-        # OSQP keeps limits to its tolerance, this keeps them exactly.
-        inside = inputs[0] if fallback else self.limits.within_stops(inputs[0], x[4:], first.dt)
-        first_rates = self.limits.clipped(inside, u_previous)
+        # OSQP keeps limits to its tolerance and within its horizon, this keeps them exactly and ever after.
+        first_rates = self.limits.kept(inputs[0], u_previous, x[4:], first.dt)
         states = answer.states
         if states is None or inputs[0].tolist() != first_rates.tolist():
             inputs[0] = first_rates
@@ -229,15 +228,15 @@ class LinearMPC:
             inputs = _shifted(self._last.inputs)
         elif self._gain is not None and np.isfinite(x).all():
             fallback = "lqr"
-            inputs[0] = self.limits.within_stops(lqr_rates(self._gain, x, reference, self._dt), x[4:], self._dt)
+            inputs[0] = lqr_rates(self._gain, x, reference, self._dt)
         else:
             fallback = "hold"
-        inputs[0] = wanted = self.limits.clipped(asked := inputs[0].copy(), u_previous)
+        inputs[0] = wanted = self.limits.kept(asked := inputs[0].copy(), u_previous, x[4:], self._dt)
         if fallback == "shifted_plan":
-            inputs[-1] = self.limits.clipped(np.zeros(n), inputs[-2] if len(inputs) > 1 else inputs[0])
+            inputs[-1] = self.limits.slowed(inputs[-2] if len(inputs) > 1 else inputs[0])
         else:
             for k in range(1, len(inputs)):
-                inputs[k] = self.limits.clipped(np.zeros(n), inputs[k - 1])
+                inputs[k] = self.limits.slowed(inputs[k - 1])
         self._age += 1
         models, states = None, None
         if self._last is not None and self._last.models is not None and np.isfinite(x).all():

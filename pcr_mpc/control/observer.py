@@ -67,15 +67,21 @@ class DisturbanceObserver:
         """Begin at a known state, without a force."""
         self.x, self.force = x.copy(), np.zeros(2)
 
-    def correct(self, p: np.ndarray, q: np.ndarray) -> None:
-        """Take in a measurement of the tip [m] and the motor angles [rad].
+    def correct(self, p: np.ndarray | None, q: np.ndarray | None) -> None:
+        """Take in a measurement of the tip [m] and the motor angles [rad]; None: there is none.
 
         An encoder says in which interval the angle is; within it the prediction, which knows the commands, is better.
         """
-        change = self.gain @ (p - self.x[:2])
-        self.x[:4] += change[:4]
-        self.force += change[4:]
-        self.x[4:] = np.minimum(np.maximum(self.x[4:], q - self._half_step), q + self._half_step)
+        if p is not None:
+            change = self.gain @ (p - self.x[:2])
+            self.x[:4] += change[:4]
+            self.force += change[4:]
+        if q is not None:
+            self.x[4:] = np.minimum(np.maximum(self.x[4:], q - self._half_step), q + self._half_step)
+
+    def move(self, p: np.ndarray, v: np.ndarray) -> None:
+        """Begin anew with the tip elsewhere, at position p [m] and velocity v [m/s], and no force suspected."""
+        self.x[:2], self.x[2:4], self.force = p, v, np.zeros(2)
 
     def predict(self, model: LinearModel, u: np.ndarray) -> None:
         """Move on by one period in which the rates u are applied; ``model`` must know the force."""

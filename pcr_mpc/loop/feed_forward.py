@@ -20,6 +20,7 @@ from .scene import Scene
 # each time the error falls as the rods' share of the mass, 1/200 of the change on the default robot.
 _SETTLED = 1e-5
 _MOST_SWEEPS = 20
+_STRIDE = 25  # periods from which to which the rods are followed along a reference that was solved before
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -114,9 +115,15 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
             )
         v = own
     rates = np.diff(q, axis=0) / scene.period
+    return _inverse_dynamics(np.hstack([p, v, q]), rates, forces, poses)
+
+
+def _inverse_dynamics(
+    states: np.ndarray, rates: np.ndarray, forces: np.ndarray, poses: list[Equilibrium]
+) -> InverseDynamics:
     levers = np.stack([np.linalg.pinv(eq.dforce_dq) for eq in poses])
     return InverseDynamics(
-        np.hstack([p, v, q]),
+        states,
         rates,
         forces,
         angles_per_force=levers,
@@ -125,6 +132,32 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
         stiffness=np.array([eq.stiffness_eigenvalues[0] for eq in poses]),
         rod_margin=np.array([least_rod_margin(eq) for eq in poses]),
     )
+
+
+def held(
+    reference: InverseDynamics, k: int, robot: Robot, pose: Equilibrium, payload: float, count: int
+) -> InverseDynamics:
+    """The point of the reference in period k, held at rest for ``count`` periods.
+
+    Parameters
+    ----------
+    reference : InverseDynamics
+    k : int
+    robot : Robot
+        As it is believed to be.
+    pose : Equilibrium
+        At the start of the reference; its branch is followed.
+    payload : float
+        That the tip carries [kg].
+    count : int
+    """
+    on_the_way = np.unique([*range(0, k, _STRIDE), k])
+    p = reference.states[[*on_the_way, k], :2]
+    forces = np.vstack([reference.forces[on_the_way], payload * np.array(robot.gravity)])
+    end = _poses(robot, pose, np.full(len(p), np.nan), p, forces)[-1]
+    state = np.concatenate([end.p, np.zeros(2), end.q])
+    states, forces = np.tile(state, (count + 1, 1)), np.tile(forces[-1], (count + 1, 1))
+    return _inverse_dynamics(states, np.zeros((count, robot.n_rods)), forces, [end] * (count + 1))
 
 
 def _poses(robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray) -> list[Equilibrium]:

@@ -71,7 +71,8 @@ class Run(Frozen):
     rungs : dict
         How many poses of the plant each rung of the statics' ladder has solved (see `RodSolver`).
     events : list of dict
-        Warnings, fall-backs, missed deadlines, snaps and failures: time, kind, message.
+        Warnings, fall-backs, missed deadlines, measurements that were not believed, snaps and failures: time, kind,
+        message.
     rung : PlantSettings or None
         Physics and discretisation of the plant. None: it was another engine's.
     measured : ndarray, shape (M, 4 + n)
@@ -139,8 +140,11 @@ class Run(Frozen):
         lower, upper = robot.angle_limits.T
         broken = np.abs(self.u).max(axis=1, initial=0.0) > robot.rate_limit + _LIMIT_SLACK
         broken |= np.abs(change).max(axis=1, initial=0.0) > robot.acceleration_limit * period + _LIMIT_SLACK
-        outside = ((angles < lower - _ANGLE_SLACK) | (angles > upper + _ANGLE_SLACK)).any(axis=1)
-        broken[: len(outside)] |= outside
+        # Coming back from beyond a stop breaks nothing.
+        outside = (angles < lower - _ANGLE_SLACK) & (angles <= starts) | (angles > upper + _ANGLE_SLACK) & (
+            angles >= starts
+        )
+        broken[: len(outside)] |= outside.any(axis=1)
         return int(broken.sum())
 
     @cached_property
@@ -193,6 +197,31 @@ class Run(Frozen):
         """Decisions that came after the scene's deadline, or took longer than the control period."""
         return int((self.decision_time > min(self.scene.deadline, self.scene.period)).sum())
 
+    def verdict(self) -> str:
+        """Why the run is no good, in one line; empty if it is not known to be bad.
+
+        It ended early; or fewer than half of its decisions were solved as asked; or the tip left the reference by more
+        than the scene allows.
+        """
+        found = [f"failed at t = {event['t']:.4g} s: {event['message']}" for event in self.events
+                 if event["kind"] == "failure"]  # fmt: skip
+        return "; ".join(found + self._lost())
+
+    def _lost(self) -> list[str]:
+        """What makes a run that may have come to its end a failure."""
+        found = []
+        solved = len(self.u) - sum(event["kind"] == "fallback" for event in self.events)
+        if 2 * solved < len(self.u):
+            found.append(f"only {solved} of {len(self.u)} decisions were solved")
+        if np.isfinite(self.reference).all() and len(self.t):
+            worst = int(self.error.argmax())
+            if not self.error[worst] <= self.scene.allowed_error:  # so written that NaN is lost
+                found.append(
+                    f"tip lost: {1e3 * self.error[worst]:.1f} mm from the reference at t = {self.t[worst]:.3f} s, "
+                    f"allowed are {1e3 * self.scene.allowed_error:g} mm"
+                )
+        return found
+
     def _need(self) -> dict[str, Any] | None:
         """What the scene asks of the simulation, and what is known of that."""
         need, finding = self.scene.need, self.scene.finding
@@ -227,6 +256,7 @@ class Run(Frozen):
         rungs = Counter(event["rung"] for event in self.events if event["kind"] == "fallback")
         return {
             "scene": self.scene.name,
+            "verdict": self.verdict(),
             "controller": self.controller,
             "plant": self.plant,
             "rung": None if self.rung is None else asdict(self.rung),
@@ -264,8 +294,9 @@ class Run(Frozen):
             "control_rungs": {"solved": len(self.u) - kinds.count("fallback"), **rungs},
             "deadline_misses": self.deadline_misses(),
             "snaps": kinds.count("snap"),
-            "failures": kinds.count("failure"),
             "warnings": kinds.count("warning"),
+            "refused_measurements": kinds.count("measurement"),
+            "failures": kinds.count("failure") or len(self._lost()),
             "events": self.events,
             "run_hash": self.hash(),
         }

@@ -22,6 +22,7 @@ from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 LATE = ("hold", "shifted_plan")
 # Distance of the start from the reference that is taken for the same place [m].
 _START_TOLERANCE = 1e-3
+_LOST = 0.1  # of the shortest rod
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
 
@@ -73,6 +74,10 @@ class Scene:
         What is known of the plant's rung.
     own_period : float or None
         Control period of the scene [s], where its tuning asks for another.
+    wrapped : bool
+        Encoders tell angles in (-pi, pi] only.
+    tracking_error : float or None
+        Distance of the tip from the reference beyond which a run counts as lost [m]. None: a tenth of the shortest rod.
     """
 
     name: str
@@ -97,6 +102,15 @@ class Scene:
     need: Need | None = None
     finding: Finding | None = None
     own_period: float | None = None
+    wrapped: bool = False
+    tracking_error: float | None = None
+
+    @property
+    def allowed_error(self) -> float:
+        """Distance of the tip from the reference beyond which a run counts as lost [m]."""
+        if self.tracking_error is not None:
+            return self.tracking_error
+        return _LOST * float(self.robot.lengths.min())
 
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Payload at the times t [s], same shape [kg]."""
@@ -196,6 +210,7 @@ def load_scene(path: str | Path) -> Scene:
                 torque_limit=limits.number("torque", robot.torque_limit, above=0.0),
             )
             pose_limits = _pose_limits(limits, robot)
+            tracking_error = limits.number("tracking_error", 0.0, above=0.0) or None
         with file.table("world", {}) as world:
             robot = replace(robot, gravity=world.vector("gravity", 2, robot.gravity))
         with file.table("start") as start:
@@ -222,13 +237,15 @@ def load_scene(path: str | Path) -> Scene:
             force = load.vector("force", 2, (0.0, 0.0))
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
+            wrapped = sensor.boolean("wrapped", False)
         payload = read_payload(file)
         need, finding = read_need(file), read_finding(file)
         with file.table("reference") as reference:
             trajectory = _trajectory(reference)
     scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                   tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
-                  delay, deadline, late, pose_limits, payload, need, finding)  # fmt: skip
+                  delay, deadline, late, pose_limits, payload, need, finding,
+                  wrapped=wrapped, tracking_error=tracking_error)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

@@ -140,6 +140,8 @@ def simulate(
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
             if scene.angle_step:
                 measured[4:] = scene.angle_step * np.round(measured[4:] / scene.angle_step)
+            if scene.wrapped:
+                measured[4:] -= 2 * np.pi * np.ceil(measured[4:] / (2 * np.pi) - 0.5)
             measurements[k] = measured
             began, began_cpu = time.perf_counter(), time.thread_time()
             decision = controller.step(k, measured)
@@ -153,6 +155,7 @@ def simulate(
             cost = float(control_time[k, 0]) if spent is None else spent(k, float(control_time[k, 0]))
             costs[k] = cost
             decided = k + 1
+            events += [{"t": k * scene.period, **event} for event in decision.events]
             late = 0
             if cost > scene.deadline:
                 late = min(per, math.ceil(cost / plant.dt))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from ..control.observer import DisturbanceObserver
 from ..control.plan import Plan
 from ..control.qp import Reference
 from ..control.tuning import Limits, Tuning
-from ..errors import PCRError
+from ..errors import PCRError, checked_period, measured_vector
 from ..frozen import Remade, set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
@@ -28,7 +28,8 @@ from ..plant.robot import Robot
 from ..plant.symbolic import rod_unknowns, symbolic_dynamics
 from .along_plan import AlongPlan
 from .controllers import Controller, Decision, HoldMotors
-from .feed_forward import InverseDynamics, feed_forward
+from .feed_forward import InverseDynamics, feed_forward, held
+from .gate import Event, Gate
 from .scene import Scene
 from .target import MotorTarget
 
@@ -68,6 +69,8 @@ class TrackingController(Remade):
         self._model = self._make_model()
         self._along = self._make_along()
         self._watch = LimitWatch(scene.pose_limits, self._model)
+        self._limits = motor_limits(scene.robot, scene.period)
+        self._gate = self._make_gate()
         self._target = MotorTarget(self.robot)
         self._sent: deque[np.ndarray] = deque(maxlen=scene.delay)
         self._on_the_way: deque[np.ndarray] = deque()
@@ -75,6 +78,7 @@ class TrackingController(Remade):
         self._plan: Plan | None = None
         self._inverse = MotorTarget(self.robot)
         self._law: Law | None = None
+        self._end: InverseDynamics | None = None  # the last point of the reference, once it is held
 
     @property
     def reference(self) -> InverseDynamics:
@@ -83,7 +87,7 @@ class TrackingController(Remade):
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
-        self._pose = pose
+        self._pose, self._end = pose, None
         self._invert_dynamics(self._known)
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         if self._law is None:
@@ -107,6 +111,8 @@ class TrackingController(Remade):
                 part.reset(x, pose)
         self._target.start(pose)
         self._inverse.start(pose)
+        self._gate.start(pose.q)
+        self._reckoned = pose.q  # where the commands so far lead, whatever is measured
         self._predicts, self._seen = resting, (x, np.zeros(self.robot.n_rods))
         self._sent.extend([np.zeros(self.robot.n_rods)] * self._told.delay)
         self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
@@ -181,15 +187,30 @@ class TrackingController(Remade):
             self._law = self._make_law(self._pose)
             self._law.prepare(resting, self._watch.combinations())
 
-    def step(self, k: int, x: np.ndarray) -> Decision:
-        """See `Controller`; a measurement that is not finite is bridged by the prediction."""
-        observer = self.observer
-        force = np.zeros(2)
-        if observer is not None:
-            if all(map(math.isfinite, x[:2].tolist() + x[4:].tolist())):
-                observer.correct(x[:2], x[4:])
-            x, force = observer.x, observer.force
-        estimate = x
+    def step(self, k: int, x: Any) -> Decision:
+        """See `Controller`; what cannot have been measured is bridged by the prediction, and told in an event.
+
+        Parameters
+        ----------
+        k : int
+            Control period; beyond the end of the scene the last point of the reference is held.
+        x : array_like, shape (4 + n,)
+            Measured state [m, m/s, rad]; what is missing is NaN. With an observer the velocity is not looked at.
+
+        Raises
+        ------
+        PCRError
+            The controller was not started.
+        MeasurementError
+            The first measurement is in other units, or its angles are wrapped.
+        ValueError
+            Names the argument: x has another shape, or k is no period.
+        """
+        if self._law is None:
+            raise PCRError(f"controller {self.name} was not started: call start(pose) before the first step")
+        k, x = checked_period("k", k), measured_vector("x", x, 4 + self.robot.n_rods)
+        x, force, events = self._estimate(k, x)
+        observer, estimate = self.observer, x
         began = time.perf_counter()
         failure, now, ahead = "", None, x
         models: LinearModel | list[LinearModel] | None = None
@@ -206,14 +227,15 @@ class TrackingController(Remade):
                 raise
             failure, models = f"no linear model: {error}", None
         linearised = time.perf_counter() - began
-        window = self._window(k + self._delay, force)
-        assert self._law is not None
+        window = self._window(k, force)
         if models is None:
             plan = self._law.fall_back(failure, ahead, window, self._u)
         else:
             plan = self._law.solve(ahead, models, window, self._u, pose_limits)
+        plan = self._within_stops(plan, ahead)
         self._u, self._plan = plan.inputs[0], plan
         self._sent.append(self._u)
+        self._reckoned = self._reckoned + self._scene.period * self._u
         self._on_the_way.append(self._u)
         arriving = self._on_the_way.popleft()
         if now is not None:
@@ -225,7 +247,31 @@ class TrackingController(Remade):
         if observer is not None:
             observer.predict(self._predicts, arriving)
         self._seen = x, arriving
-        return Decision(plan.inputs[0], plan, linearised, estimate, force)
+        return Decision(plan.inputs[0], plan, linearised, estimate, force, events)
+
+    def _estimate(self, k: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[Event, ...]]:
+        """State [m, m/s, rad] and unknown force [N] after what of the measured state is to be believed."""
+        observer = self.observer
+        expected = self._expected()
+        found = self._gate.sift(k, x, expected, observer is None)
+        if observer is None:
+            velocity = x[2:4] if found.velocity is None else found.velocity
+            tip = expected[:4] if found.p is None else np.concatenate([found.p, velocity])
+            q = expected[4:] if found.q is None else found.q
+            return np.concatenate([tip, q]), np.zeros(2), found.events
+        if found.p is not None and found.velocity is not None:
+            observer.move(found.p, found.velocity)
+        observer.correct(found.p, found.q)
+        return observer.x, observer.force, found.events
+
+    def _within_stops(self, plan: Plan, ahead: np.ndarray) -> Plan:
+        """The plan, its first rates within the stops for the sum of the commands too: a wrong angle may be measured."""
+        first = plan.inputs[0]
+        kept = self._limits.kept(first, self._u, ahead[4:], self._scene.period, self._reckoned)
+        if kept.tolist() == first.tolist():
+            return plan
+        active = plan.active if "angle" in plan.active else (*plan.active, "angle")
+        return replace(plan, inputs=np.vstack([kept, plan.inputs[1:]]), active=active)
 
     def _linearise(self, x: np.ndarray, k: int, force: np.ndarray) -> LinearModel | list[LinearModel]:
         here = self._model_at(k + self._delay, x, self._u, force)
@@ -233,26 +279,40 @@ class TrackingController(Remade):
             return here
         first = k + self._delay + 1
         # The last plan, one period on; at the start, and beyond the end of a shorter plan, the reference.
-        path = self._reference.states[first : first + self.tuning.horizon - 1]
+        reference, row = self._rows(k, first)
+        path = reference.states[row : row + self.tuning.horizon - 1]
         if self._plan is not None and self._plan.states is not None:
             known = self._plan.states[2:]
             path = known if len(known) == len(path) else np.concatenate([known[: len(path)], path[len(known) :]])
-        return [here, *self._along.models(path, self._u, force, self._payloads[first : first + len(path)])]
+        last = len(self._payloads) - 1
+        payloads = self._payloads[[min(j, last) for j in range(first, first + len(path))]]
+        return [here, *self._along.models(path, self._u, force, payloads)]
 
     def _model_at(self, k: int, x: np.ndarray, u: np.ndarray, force: np.ndarray) -> LinearModel:
         """Linear model about x, with what the tip carries in period k."""
-        payload = float(self._payloads[k])
+        payload = float(self._payloads[min(k, len(self._payloads) - 1)])
         if payload != self._model.payload:
             self._model.carry(payload, x)
         return linearise(self._model, x, u, self._scene.period, force)
 
+    def _rows(self, k: int, row: int) -> tuple[InverseDynamics, int]:
+        """Where to read the reference's ``row`` in period k: beyond the scene's end its last point is held."""
+        last = self._scene.n_periods
+        if k < last:
+            return self._reference, row
+        if self._end is None:
+            payload = float(self._payloads[-1])
+            self._end = held(self._reference, last, self.robot, self._pose, payload, self.tuning.horizon)
+        return self._end, 0
+
     def _window(self, k: int, force: np.ndarray) -> Reference:
-        """Reference over the horizon from period k on, its angles moved to carry the unknown force."""
-        horizon, reference = self.tuning.horizon, self._reference
-        states, inputs = reference.states[k + 1 : k + 1 + horizon], reference.inputs[k : k + horizon]
-        forces = reference.forces[k + 1 : k + 1 + horizon]
+        """Reference over the horizon of a decision in period k, its angles moved to carry the unknown force."""
+        horizon = self.tuning.horizon
+        reference, row = self._rows(k, k + self._delay)
+        states, inputs = reference.states[row + 1 : row + 1 + horizon], reference.inputs[row : row + horizon]
+        forces = reference.forces[row + 1 : row + 1 + horizon]
         if self.observer is not None:
-            end, lever = states[-1], self._reference.angles_per_force[k + horizon]
+            end, lever = states[-1], reference.angles_per_force[row + horizon]
             forces = forces + force
             shift = self._target.small_shift(end[:2], end[4:], lever, force)
             states = states.copy()
@@ -286,6 +346,11 @@ class TrackingController(Remade):
             return None
         return AlongPlan([self._make_model() for _ in range(self.tuning.horizon - 1)], self._scene.period)
 
+    def _make_gate(self) -> Gate:
+        scene, observer = self._told, self.tuning.observer
+        noise = max(scene.tip_noise, observer.tip_noise if observer else 0.0)
+        return Gate(self.robot, self._limits, scene.period, noise, scene.angle_step, scene.wrapped)
+
     def _make_observer(self, resting: LinearModel) -> DisturbanceObserver | None:
         if self.tuning.observer is None:
             return None
@@ -299,7 +364,7 @@ class TrackingController(Remade):
         )  # fmt: skip
 
     def _make_law(self, pose: Equilibrium) -> Law:
-        tuning, limits = self.tuning, motor_limits(self._scene.robot, self._scene.period)
+        tuning, limits = self.tuning, self._limits
         if tuning.law == "linear_mpc":
             return LinearMPC(tuning, limits)
         if tuning.law == "nonlinear_mpc":

@@ -28,8 +28,9 @@ def without_rounding(values: np.ndarray, scale: float) -> np.ndarray:
 
 
 def summary_table(summary: dict[str, Any]) -> str:
-    """Figures of a run."""
+    """Figures of a run; first of all what is wrong with it."""
     lines = [
+        *([f"FAILED      {summary['verdict']}", ""] if summary["verdict"] else []),
         f"scene       {summary['scene']} ({summary['duration_s']:g} s)",
         f"controller  {summary['controller']}",
         f"plant       {summary['plant']}",
@@ -69,6 +70,7 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"limit violations  {summary['limit_violations']}",
         f"fall-backs        {summary['fallbacks']}",
         f"deadline misses   {summary['deadline_misses']}",
+        f"not believed      {summary['refused_measurements']} measurements",
         f"failures          {summary['failures']}",
         *(f"warning           {event['message']}" for event in summary["events"] if event["kind"] == "warning"),
     ]
