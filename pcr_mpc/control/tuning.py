@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import checked_number
+from ..errors import ModelError, checked_number
 from ..toml_table import read_toml
 from .observer import ObserverTuning
 
@@ -17,6 +17,8 @@ LAWS = ("linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward")
 LINEARISE = ("here", "along_plan")
 INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
+# Matrices grow with the square of the horizon: at this one they are made in half a minute.
+LONGEST_HORIZON = 400
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,8 @@ class Tuning:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+        if problem := _horizon_problem(self.horizon):
+            raise ModelError(f"horizon {problem}", key="horizon")
         if self.law not in LAWS:
             raise ValueError(f"law is {self.law!r}, expected one of {', '.join(LAWS)}")
         for name in ("position_weight", "input_weight", "tolerance"):
@@ -151,6 +155,12 @@ class Limits:
         return tuple(kind for kind, where in met.items() if where.any()) or ("angle",)
 
 
+def _horizon_problem(horizon: int) -> str | None:
+    if horizon <= LONGEST_HORIZON:
+        return None
+    return f"is {horizon}, expected at most {LONGEST_HORIZON}; take a longer period to look further"
+
+
 def load_tuning(path: str | Path) -> Tuning:
     """Read a controller tuning from TOML (see ``controllers/default.toml``).
 
@@ -177,12 +187,15 @@ def load_tuning(path: str | Path) -> Tuning:
         predicts, weighs = law.endswith("mpc"), law.endswith("mpc") or law == "lqr"
         gains = (pd.number("position"), pd.number("velocity", 0.0)) if law == "pd" else (0.0, 0.0)
         period = file.number("period", 0.0, minimum=0.0)
+        horizon = file.integer("horizon") if predicts else 1
+        if problem := _horizon_problem(horizon):
+            raise file.fail("horizon", problem)
         return Tuning(
             name=file.text("name"),
             law=law,
             period=period or None,
             pd=gains,
-            horizon=file.integer("horizon") if predicts else 1,
+            horizon=horizon,
             position_weight=weights.number("position", above=0.0) if weighs else 1.0,
             velocity_weight=weights.number("velocity", 0.0, minimum=0.0),
             angle_weight=weights.number("angle", 0.0, minimum=0.0),

@@ -56,6 +56,8 @@ class AlongPlan:
 
         ``payloads`` are what the tip carries there, shape (N - 1,) [kg].
         """
+        if not self._spots:  # a horizon of one period has but the model at its start
+            return []
         places = np.concatenate([path[:, :2], path[:, 4:]], axis=1)
         # So written that NaN is far.
         near = (np.abs(places - self._at) <= self._moved).all(axis=1).tolist()
@@ -74,9 +76,8 @@ class AlongPlan:
                 model = LinearModel(model.A, model.B, c, model.E, model.dt, force.copy())
             spot.model = model
             found.append(model)
-        if self._spots:
-            # The next place of the first spot is the new end of the horizon.
-            self._spots.rotate(-1)
-            self._at[:-1] = self._at[1:]
-            self._at[-1] = np.nan
+        # The next place of the first spot is the new end of the horizon.
+        self._spots.rotate(-1)
+        self._at[:-1] = self._at[1:]
+        self._at[-1] = np.nan
         return found
