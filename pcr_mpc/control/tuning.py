@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import ModelError, checked_number
+from ..files import name_problem
 from ..toml_table import read_toml
 from .observer import ObserverTuning
 
@@ -97,6 +98,8 @@ class Tuning:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+        if problem := name_problem(self.name):
+            raise ModelError(f"name: {problem}", key="name")
         if problem := _horizon_problem(self.horizon):
             raise ModelError(f"horizon {problem}", key="horizon")
         if self.law not in LAWS:
@@ -187,11 +190,13 @@ def load_tuning(path: str | Path) -> Tuning:
         predicts, weighs = law.endswith("mpc"), law.endswith("mpc") or law == "lqr"
         gains = (pd.number("position"), pd.number("velocity", 0.0)) if law == "pd" else (0.0, 0.0)
         period = file.number("period", 0.0, minimum=0.0)
-        horizon = file.integer("horizon") if predicts else 1
+        horizon, name = file.integer("horizon") if predicts else 1, file.text("name")
+        if problem := name_problem(name):
+            raise file.fail("name", problem)
         if problem := _horizon_problem(horizon):
             raise file.fail("horizon", problem)
         return Tuning(
-            name=file.text("name"),
+            name=name,
             law=law,
             period=period or None,
             pd=gains,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import interrupt
 from ..linearisation.linear_model import LinearModel
 from ..linearisation.linearise import linearise
 from ..plant.dynamics import Plant
@@ -48,6 +49,7 @@ class AlongPlan:
         """Forget the models; all rods are in ``pose``."""
         self._at[:] = np.nan
         for spot in self._spots:
+            interrupt.check()
             spot.plant.reset(x, pose)
             spot.model = None
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import interrupt
 from ..control.qp import Reference
 from ..errors import ConvergenceError, PCRError
 from ..plant.dynamics import Plant
@@ -108,6 +109,7 @@ def _angles(
     (K, n, 2) [rad/N]."""
     angles, levers, eq = np.empty((len(t), robot.n_rods)), np.empty((len(t), robot.n_rods, 2)), pose
     for k in range(len(t)):
+        interrupt.check()
         try:
             eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
@@ -124,6 +126,7 @@ def _momentum(
     n = 2 + plant.robot.n_rods
     momentum, push, own = (np.empty_like(p) for _ in range(3))
     for k in range(len(p)):
+        interrupt.check()
         mass, slopes = plant.mass(p[k], q[k])
         w = np.concatenate([v[k], rates[k]])
         momentum[k] = mass[:2] @ w

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from tqdm import tqdm
 
+from .. import interrupt
 from ..loop.run import Run
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
@@ -76,6 +77,7 @@ def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
     # The branch is followed through every tenth state, not jumped to.
     found = {}
     for k in range(len(run.x)):
+        interrupt.check()
         if k in wanted or k % 10 == 0:
             eq = plant.equilibrium(run.x[k]) if k in wanted else None
             if eq is None:
@@ -172,6 +174,7 @@ def animate_run(run: Run, path: Path, progress: bool = False) -> None:
     bar = tqdm(total=len(indices), desc="animation", unit="frame", disable=not progress)
 
     def show(i: int) -> list[Any]:
+        interrupt.check()
         for line, shape in zip(rods, shapes[i], strict=True):
             line.set_data(*shape.T)
         trace.set_data(*run.x[: indices[i] + 1, :2].T)
