@@ -1,6 +1,6 @@
 """Files that the toolkit writes: whole or not at all, and over nothing that it did not write itself.
 
-A text file says in its first line that it was written here, with a digest of the rest; a picture says so in its
+A text file says in its last line that it was written here, with a digest of the rest; a picture says so in its
 metadata; a folder of results has a list of its files with their digests. What does not, or was changed since, is
 somebody's work.
 """
@@ -13,7 +13,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -43,9 +43,9 @@ def name_problem(name: Any) -> str | None:
 
 
 def stamped(text: str, comment: tuple[str, str] = ("# ", "")) -> str:
-    """Text under a line of comment that says who wrote it; ``comment`` is what begins and ends such a line."""
-    first = f"{_STAMP} ({_digest(text.encode())}); once edited by hand it is not overwritten without --force"
-    return f"{comment[0]}{first}{comment[1]}\n{text}"
+    """Text with a last line of comment that says who wrote it; ``comment`` is what begins and ends such a line."""
+    last = f"{_STAMP} ({_digest(text.encode())}); once changed by hand it is not overwritten without --force"
+    return f"{text}{comment[0]}{last}{comment[1]}\n"
 
 
 def picture_metadata(path: Path) -> dict[str, str] | None:
@@ -61,9 +61,9 @@ def ours(path: Path) -> bool:
         return True
     if path.suffix.lower() in _CREATOR:
         return _STAMP.encode() in content
-    first, _, rest = content.partition(b"\n")
-    found = re.search(rf"{_STAMP} \((\w+)\)".encode(), first)
-    return found is not None and found[1].decode() == _digest(rest)
+    *rest, last = content.splitlines(keepends=True) or [b""]
+    found = re.search(rf"{_STAMP} \((\w+)\)".encode(), last)
+    return found is not None and found[1].decode() == _digest(b"".join(rest))
 
 
 def require_free(path: Path, *, force: bool = False) -> None:
@@ -144,6 +144,25 @@ def results(folder: Path, *, keep: Iterable[str] = ()) -> Iterator[Path]:
         write_text(folder / _LIST, json.dumps({"written by pcr-mpc": digests}, indent=2) + "\n")
         for path in new:
             os.replace(path, folder / path.name)
+
+
+def saved(write: Callable[[Path], Any], folder: Path) -> tuple[Path, str]:
+    """Let ``write`` write into a folder, or where that fails into a temporary one: what was computed is never lost.
+
+    Returns
+    -------
+    folder : Path
+        Where it is.
+    problem : str
+        Why it is not where it should be; empty if it is.
+    """
+    try:
+        write(folder)
+        return folder, ""
+    except (OSError, OutputError) as error:
+        elsewhere = Path(tempfile.mkdtemp(prefix="pcr-mpc-"))
+        write(elsewhere)
+        return elsewhere, f"{folder}: {error}; what was computed is in {elsewhere}"
 
 
 def _listed(folder: Path) -> dict[str, str]:

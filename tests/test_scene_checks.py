@@ -88,7 +88,7 @@ def test_a_duration_that_is_cut_is_said_with_the_file(tmp_path):
     with pytest.raises(ModelError, match=r"scene\.toml: duration is 2\.0049 s") as caught:
         load_scene(path)
     assert caught.value.key == "duration"
-    with pytest.raises(ModelError, match="period 0.02 s does not fit scene .* the duration 0.05 s a multiple of it"):
+    with pytest.raises(ModelError, match=r"period 0\.02 s does not fit .* duration 0\.05 s a multiple of it"):
         replace(load_scene(LEMNISCATE), duration=0.05).tuned(
             replace(load_tuning(CONTROLLERS / "default.toml"), period=0.02)
         )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
+from numbers import Real
 from typing import Any
 
 # What is called, with how many arguments; and what is only read, and of which type.
 _CONTROLLER = {"start": 1, "step": 2}, {"name": str}
 _PLANT = (
     {"reset": 2, "carry": 2, "step": 3},
-    {"method": str, "integrator": str, "dt": float, "snaps": None, "rungs": None},
+    {"method": str, "integrator": str, "dt": Real, "snaps": list, "rungs": dict},
 )
 
 
@@ -30,7 +31,7 @@ def check_parts(plant: Any, controller: Any) -> None:
             if not hasattr(part, name):
                 raise ValueError(f"{role} {kind} has no {name!r}; {hint}")
             value = getattr(part, name)
-            if wanted is not None and not isinstance(value, wanted):
+            if not isinstance(value, wanted):
                 raise ValueError(f"{role} {kind} has {name} = {value!r}, expected a {wanted.__name__}; {hint}")
         for name, count in methods.items():
             method = getattr(part, name, None)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import PCRError
+from ..files import require_folder, results
 from ..frozen import freeze
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
@@ -25,6 +26,7 @@ from .settings import PlantSettings
 # Commands within this of a limit keep it: rounding for rates, the QP's tolerance for angles.
 _LIMIT_SLACK = 1e-9
 _ANGLE_SLACK = 1e-5
+RECORD = ("run.npz", "run.csv", "summary.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,7 @@ class Run:
         for x in self.x[:: self.steps_per_period]:
             try:
                 largest = max(largest, float(np.abs(plant.equilibrium(x).motor_torque).max()))
-            except PCRError:
+            except (PCRError, ValueError):
                 break
         return largest
 
@@ -207,19 +209,32 @@ class Run:
             "run_hash": self.hash(),
         }
 
-    def save(self, folder: str | Path) -> dict[str, str]:
-        """Write run.npz, run.csv and summary.json; return their paths by name."""
+    def save(self, folder: str | Path, *, force: bool = False) -> dict[str, str]:
+        """Write run.npz, run.csv and summary.json; return their paths by name.
+
+        They replace what an earlier run has left in the folder, its pictures too.
+
+        Raises
+        ------
+        OutputError
+            A file of this name was not written here, or was changed since, and ``force`` is not given.
+        """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        files = {name: str(folder / name) for name in ("run.npz", "run.csv", "summary.json")}
+        files = {name: str(folder / name) for name in RECORD}
+        require_folder(folder, files, force=force)
+        with results(folder) as staged:
+            self._write(staged, files)
+        return files
+
+    def _write(self, folder: Path, files: dict[str, str]) -> None:
         np.savez_compressed(
-            files["run.npz"], t=self.t, x=self.x, u=self.u, reference=self.reference, plant_time=self.plant_time,
+            folder / "run.npz", t=self.t, x=self.x, u=self.u, reference=self.reference, plant_time=self.plant_time,
             control_time=self.control_time, iterations=self.iterations,
             rung=json.dumps(self.rung and asdict(self.rung)), need=json.dumps(self._need()),
         )  # fmt: skip
         n = self.scene.robot.n_rods
         per = self.steps_per_period
-        with open(files["run.csv"], "w", newline="", encoding="utf-8") as handle:
+        with open(folder / "run.csv", "w", newline="", encoding="utf-8") as handle:
             writer = csv.writer(handle)
             writer.writerow(["t_s", "p_x_m", "p_y_m", "v_x_m_s", "v_y_m_s", *(f"q{i}_rad" for i in range(n)),
                              "ref_x_m", "ref_y_m", *(f"u{i}_rad_s" for i in range(n))])  # fmt: skip
@@ -227,8 +242,8 @@ class Run:
                 period = min(k // per, len(self.u) - 1)
                 rates = self.u[period] if len(self.u) else np.full(n, math.nan)
                 writer.writerow(f"{value:.9g}" for value in (t, *x, *reference, *rates))
-        Path(files["summary.json"]).write_text(json.dumps({**self.summary(), "files": files}, indent=2) + "\n")
-        return files
+        text = json.dumps({**self.summary(), "files": files}, indent=2)
+        (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
 
 
 def percentiles(values: np.ndarray) -> dict[str, float | None]:

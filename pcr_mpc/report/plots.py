@@ -10,10 +10,11 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from tqdm import tqdm
 
 from .. import interrupt
+from ..files import replacing
 from ..loop.run import Run
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
-from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt
+from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt, save_figure
 
 _FRAMES_PER_SECOND = 20
 _LONGEST_ANIMATION = 4.0  # s of the run shown
@@ -45,8 +46,7 @@ def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
         f"{eq.robot.name}: mode {eq.mode}, {verdict}\nF = ({eq.force[0]:.3g}, {eq.force[1]:.3g}) N, "
         f"U = {eq.energy:.4g} J"
     )
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
@@ -65,8 +65,7 @@ def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
                        color="black" if eq.stable else RED)  # fmt: skip
     for axes in panels.flat[len(found) :]:
         axes.set_visible(False)
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
@@ -136,8 +135,7 @@ def plot_run(run: Run, path: Path) -> None:
         },
     )
     figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def plot_times(axes: Any, samples: dict[str, tuple[np.ndarray, str]], budgets: dict[str, tuple[float, str]]) -> None:
@@ -184,6 +182,9 @@ def animate_run(run: Run, path: Path, progress: bool = False) -> None:
         return [*rods, trace, tip, clock]
 
     animation = FuncAnimation(figure, show, frames=len(indices), init_func=lambda: [], blit=False)
-    animation.save(path, writer=PillowWriter(fps=_FRAMES_PER_SECOND))
-    bar.close()
-    plt.close(figure)
+    try:
+        with replacing(path) as draft:
+            animation.save(draft, writer=PillowWriter(fps=_FRAMES_PER_SECOND))
+    finally:
+        bar.close()
+        plt.close(figure)

@@ -25,8 +25,8 @@ from .provenance import differences
 Row = dict[str, Any]
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
-# Libraries that spread over all cores would fight for those of the other workers.
 _LISTEN = 0.1  # s, between looks at whether to stop while others work
+# Libraries that spread over all cores would fight for those of the other workers.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
