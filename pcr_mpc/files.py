@@ -90,7 +90,8 @@ def require_free(path: Path, *, force: bool = False) -> None:
             probe.write(b"a full disk takes names, but no bytes")
         if path.exists() and not force and not ours(path):
             raise OutputError(
-                f"{path} is not as pcr-mpc wrote it, and is left alone: give another --out, or --force to overwrite it",
+                f"{path} is not as pcr-mpc wrote it, and is left alone: give another name, or --force (statics: "
+                "--overwrite) to overwrite it",
                 path=str(path),
             )
     except OSError as error:
