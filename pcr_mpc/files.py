@@ -78,9 +78,8 @@ def require_free(path: Path, *, force: bool = False) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
-        raise OutputError(
-            f"{path.parent}: is a file, not a folder; give another --out", path=str(path.parent)
-        ) from None
+        file = next(place for place in (path.parent, *path.parents) if place.is_file())
+        raise OutputError(f"{file}: a file is where a folder is wanted; give another name", path=str(file)) from None
     except OSError as error:
         raise OutputError(f"{path.parent}: cannot be made: {error.strerror}", path=str(path.parent)) from None
     if path.is_dir():

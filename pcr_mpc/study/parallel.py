@@ -7,11 +7,11 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,6 +25,7 @@ from .provenance import differences
 Row = dict[str, Any]
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
+_PATIENCE = 2.0  # s
 _LISTEN = 0.1  # s, between looks at whether to stop while others work
 # Libraries that spread over all cores would fight for those of the other workers.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -41,21 +42,23 @@ def local_workers(jobs: int | None = None) -> Iterator[ProcessPoolExecutor]:
     try:
         # Not forked: a fork of a process with threads may hang.
         context = multiprocessing.get_context("spawn")
-        ear, mouth = context.Pipe(duplex=False)
         resource_tracker.ensure_running()  # which, when it is started, lets signals through
-        executor = _Workers(jobs, mp_context=context, initializer=_follow_the_parent, initargs=(ear,))
+        others = set(multiprocessing.active_children())
+        executor = _Workers(jobs, mp_context=context, initializer=_follow_the_parent)
         try:
-            with executor:
-                try:
-                    yield executor
-                except BaseException:
-                    # What the workers are at is of no more use; finished rows are with the caller.
-                    executor.shutdown(wait=False, cancel_futures=True)
-                    mouth.close()
-                    raise
+            yield executor
+        except BaseException:
+            # What the workers are at is of no more use; finished rows are with the caller.
+            executor.shutdown(wait=False, cancel_futures=True)
+            # Until its thread has put away what was cancelled, it would fail on that loudly.
+            patience = time.monotonic() + _PATIENCE
+            while getattr(executor, "_cancel_pending_futures", False) and time.monotonic() < patience:
+                time.sleep(0.01)
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()
+            raise
         finally:
-            mouth.close()
-            ear.close()
+            executor.shutdown()
     finally:
         for name, value in before.items():
             if value is None:
@@ -78,14 +81,16 @@ class _Workers(ProcessPoolExecutor):
             return super().submit(*arguments, **keywords)
 
 
-def _follow_the_parent(ear: Connection) -> None:
+def _follow_the_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # A parent that is killed, or closes its end of the pipe, is not to leave workers behind.
-    threading.Thread(target=_end_with_the_parent, args=(ear,), daemon=True).start()
+    # A parent that is killed leaves its workers waiting for ever.
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
 
 
-def _end_with_the_parent(ear: Connection) -> None:
-    ear.poll(None)
+def _end_with_the_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
     os._exit(1)
 
 
