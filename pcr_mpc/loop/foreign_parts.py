@@ -14,8 +14,8 @@ _PLANT = (
 )
 
 
-def check_parts(plant: Any, controller: Any) -> None:
-    """Check that plant and controller have what `simulate` calls and records.
+def check_parts(plant: Any, controller: Any, *, carries: bool) -> None:
+    """Check that plant and controller have what `simulate` calls and records; `carry` where there is a payload.
 
     Raises
     ------
@@ -34,6 +34,8 @@ def check_parts(plant: Any, controller: Any) -> None:
             if not isinstance(value, wanted):
                 raise ValueError(f"{role} {kind} has {name} = {value!r}, expected a {wanted.__name__}; {hint}")
         for name, count in methods.items():
+            if name == "carry" and not carries:
+                continue
             method = getattr(part, name, None)
             if not callable(method):
                 raise ValueError(f"{role} {kind} has no method {name!r}; {hint}")

@@ -58,7 +58,7 @@ def simulate(
     ValueError
         Before the start: names what plant or controller lack.
     """
-    check_parts(plant, controller)
+    check_parts(plant, controller, carries=scene.payload is not None)
     per = round(scene.period / plant.dt)
     if per < 1 or abs(per * plant.dt - scene.period) > 1e-9 * scene.period:
         raise ValueError(f"plant.dt = {plant.dt} s does not divide the control period {scene.period} s")
