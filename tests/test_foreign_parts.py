@@ -85,8 +85,8 @@ def throw(error):
         (throw(KeyboardInterrupt()), "interrupted"),
         (lambda k: None, "AttributeError"),
         (lambda k: np.zeros(2), "AttributeError"),
-        (lambda k: Decision(np.zeros(1)), r"u of the controller's Decision has shape \(1,\), expected \(2,\)"),
-        (lambda k: Decision(np.full(2, np.nan)), "u of the controller's Decision is not finite"),
+        (lambda k: Decision(np.zeros(1)), r"the controller's u has shape \(1,\), expected \(2,\)"),
+        (lambda k: Decision(np.full(2, np.nan)), "the controller's u is not finite"),
     ],
 )
 def test_whatever_a_controller_does_the_run_until_then_is_kept(scene, how, message):

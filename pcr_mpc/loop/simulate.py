@@ -126,7 +126,7 @@ def simulate(
             control_time[k, 0] = time.perf_counter() - began
             control_time[k, 5] = time.thread_time() - began_cpu
             # Named here: NumPy would spread one number over all motors.
-            inputs[k] = checked_vector("u of the controller's Decision", decision.u, n)
+            inputs[k] = checked_vector("the controller's u", decision.u, n)
             decided = k + 1
             cost = float(control_time[k, 0]) if spent is None else spent(k, float(control_time[k, 0]))
             late = 0
