@@ -8,6 +8,7 @@ import math
 import sys
 from pathlib import Path
 
+from .files import require_free, stamped, write_text
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
 from .plant.mjcf import mjcf
@@ -21,6 +22,10 @@ from .report.tables import equilibria_table, equilibrium_record, equilibrium_tab
 def solve_pose(options: argparse.Namespace) -> int:
     """Run `pcr-mpc statics`."""
     robot = load_robot(options.robot)
+    if options.equilibria and options.picture is None:
+        options.picture = Path("results") / "equilibria.png"
+    if options.picture:
+        require_free(options.picture, force=options.overwrite)
     q = options.q
     if options.method and (options.p is None or q is None):
         raise ValueError("--method goes with both --p and --q")
@@ -69,19 +74,17 @@ def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:
         print(json.dumps(records))
     else:
         print(equilibria_table(found))
-    picture = options.picture or Path("results") / "equilibria.png"
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    plot_equilibria(found, picture)
-    print(f"drawn in {picture}", file=sys.stderr)
+    plot_equilibria(found, options.picture)
+    print(f"drawn in {options.picture}", file=sys.stderr)
     return 0
 
 
 def export(options: argparse.Namespace) -> int:
     """Run `pcr-mpc export`."""
     robot = load_robot(options.robot)
+    require_free(options.out, force=options.overwrite)
     eq = inverse_statics(robot, options.p, mode=options.mode)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(mjcf(robot, pose=eq, links=options.links), encoding="utf-8")
+    write_text(options.out, stamped(mjcf(robot, pose=eq, links=options.links), ("<!-- ", " -->")))
     record = {"file": str(options.out), "links": options.links, "mode": eq.mode, "q": eq.q.tolist()}
     print(json.dumps(record) if options.json else f"{options.links} links a rod, mode {eq.mode}: {options.out}")
     return 0

@@ -83,6 +83,10 @@ class NoRungError(PCRError):
     """No rung of the ladder of physics meets a scene's ``need``: ``best_error`` [m], and why each was ``rejected``."""
 
 
+class OutputError(PCRError):
+    """A file cannot be written, or is somebody's work and is left alone: ``path``."""
+
+
 class StudyError(PCRError):
     """A study of many runs cannot go on, or ended without some of its results; names the file of those that it has."""
 
@@ -173,6 +177,21 @@ def checked_number(
     if problem:
         raise ValueError(f"{name}: {problem}")
     return float(value)
+
+
+def check_numbers(instance: Any, bounds: dict[str, dict[str, float]]) -> None:
+    """Replace numbers of a frozen dataclass by floats within bounds (see `checked_number`), in its ``__post_init__``.
+
+    Raises
+    ------
+    ModelError
+        Names the attribute, its value and the bounds.
+    """
+    for name, bound in bounds.items():
+        try:
+            object.__setattr__(instance, name, checked_number(name, getattr(instance, name), **bound))
+        except ValueError as error:
+            raise ModelError(str(error), key=name) from None
 
 
 def number_problem(

@@ -242,7 +242,7 @@ def test_saved_runs_read_back(run, tmp_path):
 
 
 def test_plant_step_must_divide_the_period(lemniscate):
-    plant = replace(lemniscate, plant=replace(lemniscate.plant, dt=3e-3)).make_plant()
+    plant = replace(lemniscate.plant, dt=3e-3).make(lemniscate.robot)
     with pytest.raises(ValueError, match="does not divide"):
         simulate(lemniscate, plant, HoldMotors(2))
 

@@ -17,7 +17,7 @@ from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .plan import Plan
-from .qp import Reference, assemble, model_sequence
+from .qp import LONGEST_GRAPH, Reference, assemble, model_sequence
 from .tuning import Limits, Tuning
 from .workspace import Workspace
 
@@ -81,8 +81,10 @@ class LinearMPC:
         self._prepared = model, combinations
         if self._workspace is None:
             self._workspace = Workspace(self.tuning, model)
-        for kinds in ((), *combinations):
-            self._workspace.limited(kinds)
+        # For a long horizon a solver takes a second to set up: then those that are needed are made where they are.
+        if self.tuning.horizon <= LONGEST_GRAPH:
+            for kinds in ((), *combinations):
+                self._workspace.limited(kinds)
 
     def retune(self, tuning: Tuning) -> None:
         """Let another tuning take effect, all of it, between two steps.

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import checked_number
+from ..errors import ModelError, checked_number
+from ..files import name_problem
 from ..frozen import Frozen
 from ..toml_table import read_toml
 from .observer import ObserverTuning
@@ -22,6 +23,8 @@ INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
 # Two sums of the same commands differ by rounding [rad].
 _SAME_ANGLE = 1e-9
+# Matrices grow with the square of the horizon: at this one they are made in half a minute.
+LONGEST_HORIZON = 400
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,10 @@ class Tuning:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+        if problem := name_problem(self.name):
+            raise ModelError(f"name: {problem}", key="name")
+        if problem := _horizon_problem(self.horizon):
+            raise ModelError(f"horizon {problem}", key="horizon")
         if self.law not in LAWS:
             raise ValueError(f"law is {self.law!r}, expected one of {', '.join(LAWS)}")
         for name in ("position_weight", "input_weight", "tolerance"):
@@ -222,6 +229,12 @@ class Limits(Frozen):
         return tuple(kind for kind, where in met.items() if where.any()) or ("angle",)
 
 
+def _horizon_problem(horizon: int) -> str | None:
+    if horizon <= LONGEST_HORIZON:
+        return None
+    return f"is {horizon}, expected at most {LONGEST_HORIZON}; take a longer period to look further"
+
+
 def load_tuning(path: str | Path) -> Tuning:
     """Read a controller tuning from TOML (see ``controllers/default.toml``).
 
@@ -248,12 +261,17 @@ def load_tuning(path: str | Path) -> Tuning:
         predicts, weighs = law.endswith("mpc"), law.endswith("mpc") or law == "lqr"
         gains = (pd.number("position"), pd.number("velocity", 0.0)) if law == "pd" else (0.0, 0.0)
         period = file.number("period", 0.0, minimum=0.0)
+        horizon, name = file.integer("horizon") if predicts else 1, file.text("name")
+        if problem := name_problem(name):
+            raise file.fail("name", problem)
+        if problem := _horizon_problem(horizon):
+            raise file.fail("horizon", problem)
         return Tuning(
-            name=file.text("name"),
+            name=name,
             law=law,
             period=period or None,
             pd=gains,
-            horizon=file.integer("horizon") if predicts else 1,
+            horizon=horizon,
             position_weight=weights.number("position", above=0.0) if weighs else 1.0,
             velocity_weight=weights.number("velocity", 0.0, minimum=0.0),
             angle_weight=weights.number("angle", 0.0, minimum=0.0),

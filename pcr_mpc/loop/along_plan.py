@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import interrupt
 from ..frozen import Remade
 from ..linearisation.linear_model import LinearModel
 from ..linearisation.linearise import linearise
@@ -49,6 +50,7 @@ class AlongPlan(Remade):
         """Forget the models; all rods are in ``pose``."""
         self._at[:] = np.nan
         for spot in self._spots:
+            interrupt.check()
             spot.plant.reset(x, pose)
             spot.model = None
 
@@ -57,6 +59,8 @@ class AlongPlan(Remade):
 
         ``payloads`` are what the tip carries there, shape (N - 1,) [kg].
         """
+        if not self._spots:  # a horizon of one period has but the model at its start
+            return []
         places = np.concatenate([path[:, :2], path[:, 4:]], axis=1)
         # So written that NaN is far.
         near = (np.abs(places - self._at) <= self._moved).all(axis=1).tolist()
@@ -75,9 +79,8 @@ class AlongPlan(Remade):
                 model = LinearModel(model.A, model.B, c, model.E, model.dt, force.copy())
             spot.model = model
             found.append(model)
-        if self._spots:
-            # The next place of the first spot is the new end of the horizon.
-            self._spots.rotate(-1)
-            self._at[:-1] = self._at[1:]
-            self._at[-1] = np.nan
+        # The next place of the first spot is the new end of the horizon.
+        self._spots.rotate(-1)
+        self._at[:-1] = self._at[1:]
+        self._at[-1] = np.nan
         return found

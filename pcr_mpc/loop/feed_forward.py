@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import interrupt
 from ..control.qp import Reference
 from ..errors import ConvergenceError, PCRError
 from ..frozen import Frozen
@@ -164,6 +165,7 @@ def _poses(robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces
     """Poses at which the rods carry the forces at the tips p."""
     poses, eq = [], pose
     for k in range(len(t)):
+        interrupt.check()
         try:
             eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
@@ -179,6 +181,7 @@ def _momentum(
     n = 2 + plant.robot.n_rods
     momentum, push, own = (np.empty_like(p) for _ in range(3))
     for k in range(len(p)):
+        interrupt.check()
         mass, slopes = plant.mass(p[k], q[k])
         w = np.concatenate([v[k], rates[k]])
         momentum[k] = mass[:2] @ w

@@ -8,6 +8,7 @@ import platform
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,7 @@ def record(run: Any) -> dict[str, Any]:
     }
 
 
-def write_csv(run: Any, path: str) -> None:
+def write_csv(run: Any, path: Path) -> None:
     """Write a row for each plant step of a `Run` (see `Run.save`)."""
     n, per = run.scene.robot.n_rods, run.steps_per_period
     state = ["p_x_m", "p_y_m", "v_x_m_s", "v_y_m_s", *(f"q{i}_rad" for i in range(n))]

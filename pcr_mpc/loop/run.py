@@ -16,6 +16,7 @@ import numpy as np
 
 from ..control.tuning import Tuning
 from ..errors import ModelError, PCRError
+from ..files import require_folder, results
 from ..frozen import Frozen, read_only
 from ..linearisation.linear_limits import KINDS
 from ..plant.dynamics import Plant
@@ -32,6 +33,7 @@ _LIMIT_SLACK = 1e-9
 _ANGLE_SLACK = 1e-5
 # Of a limit on poses, relative to it: the controller keeps them to its solver's tolerance.
 _POSE_SLACK = 1e-3
+RECORD = ("run.npz", "run.csv", "summary.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +161,7 @@ class Run(Frozen):
         for k, x in enumerate(states):
             try:
                 eq = plant.equilibrium(x)
-            except PCRError:
+            except (PCRError, ValueError):
                 break
             found[k] = *eq.motor_torque, least_rod_margin(eq), eq.stiffness_eigenvalues[0]
         return read_only(found)
@@ -301,20 +303,29 @@ class Run(Frozen):
             "run_hash": self.hash(),
         }
 
-    def save(self, folder: str | Path) -> dict[str, str]:
+    def save(self, folder: str | Path, *, force: bool = False) -> dict[str, str]:
         """Write run.npz, run.csv and summary.json; return their paths by name.
+
+        They replace what an earlier run has left in the folder, its pictures too.
 
         run.npz holds everything, for `load_run`; its ``about`` says as JSON what each array is, with units. run.csv has
         a row for each plant step, with what the controller was given, took for true and decided (``u0_rad_s``) in the
         control period that the step is in, what the motors got in the step (``u0_applied_rad_s``), and the torques at
         the start of the period.
+
+        Raises
+        ------
+        OutputError
+            A file of this name was not written here, or was changed since, and ``force`` is not given.
         """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        files = {name: str(folder / name) for name in ("run.npz", "run.csv", "summary.json")}
-        np.savez_compressed(files["run.npz"], **record(self), need=json.dumps(self._need()))
-        write_csv(self, files["run.csv"])
-        Path(files["summary.json"]).write_text(json.dumps({**self.summary(), "files": files}, indent=2) + "\n")
+        files = {name: str(folder / name) for name in RECORD}
+        require_folder(folder, files, force=force)
+        with results(folder) as staged:
+            np.savez_compressed(staged / "run.npz", **record(self), need=json.dumps(self._need()))
+            write_csv(self, staged / "run.csv")
+            text = json.dumps({**self.summary(), "files": files}, indent=2)
+            (staged / "summary.json").write_text(text + "\n", encoding="utf-8")
         return files
 
 

@@ -16,10 +16,10 @@ from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import forward_statics, inverse_statics
 from ..plant.robot import Robot, load_robot
 from ..toml_table import Table, read_toml
+from .scene_checks import LATE, check_scene, is_multiple
 from .settings import Finding, Need, Payload, PlantSettings, read_finding, read_need, read_payload, read_plant
-from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
+from .trajectory import Trajectory, read_trajectory
 
-LATE = ("hold", "shifted_plan")
 # Distance of the start from the reference that is taken for the same place [m].
 _START_TOLERANCE = 1e-3
 _LOST = 0.1  # of the shortest rod
@@ -112,6 +112,22 @@ class Scene:
             return self.tracking_error
         return _LOST * float(self.robot.lengths.min())
 
+    def __post_init__(self) -> None:
+        check_scene(self)
+        if not is_multiple(self.period, self.plant.dt):
+            raise ModelError(
+                f"period is {self.period} s, not a multiple of the plant's step {self.plant.dt} s", key="period"
+            )
+        if self.duration < self.period:
+            raise ModelError(f"period is {self.period} s, longer than the duration {self.duration} s", key="period")
+        if not is_multiple(self.duration, self.period):
+            whole = math.floor(self.duration / self.period)
+            raise ModelError(
+                f"duration is {self.duration} s, which is no whole number of control periods of {self.period} s; "
+                f"take {whole * self.period:.10g} or {(whole + 1) * self.period:.10g} s",
+                key="duration",
+            )
+
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Payload at the times t [s], same shape [kg]."""
         return np.zeros(np.shape(t)) if self.payload is None else self.payload.carried(t)
@@ -127,15 +143,14 @@ class Scene:
         Raises
         ------
         ModelError
-            That period is not a multiple of the plant's step.
+            That period is not a multiple of the plant's step, or the duration not one of it.
         """
         own = self.own_period or self.period
         period = tuning.period or own
-        ratio = period / self.plant.dt
-        if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio or self.duration < period:
+        if not (is_multiple(period, self.plant.dt) and is_multiple(self.duration, period)):
             raise ModelError(
                 f"{tuning.name}: period {period} s does not fit scene {self.name}: it must be a multiple of the "
-                f"plant's step {self.plant.dt} s and at most the duration {self.duration} s",
+                f"plant's step {self.plant.dt} s, and the duration {self.duration} s a multiple of it",
                 key="period",
             )
         return replace(self, tuning=tuning, period=period, own_period=own if tuning.period else None)
@@ -228,11 +243,6 @@ def load_scene(path: str | Path) -> Scene:
             delay = control.integer("delay", 0, minimum=0)
             deadline = control.number("deadline", math.inf, minimum=0.0)
             late = control.text("late", LATE[0], choices=LATE)
-            ratio = period / plant.dt
-            if duration < period:
-                raise control.fail("period", f"is {period} s, longer than the duration {duration} s")
-            if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio:
-                raise control.fail("period", f"is {period} s, not a multiple of the plant's step {plant.dt} s")
         with file.table("load", {}) as load, file.table("sensor", {}) as sensor:
             force = load.vector("force", 2, (0.0, 0.0))
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
@@ -241,11 +251,11 @@ def load_scene(path: str | Path) -> Scene:
         payload = read_payload(file)
         need, finding = read_need(file), read_finding(file)
         with file.table("reference") as reference:
-            trajectory = _trajectory(reference)
-    scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
-                  tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
-                  delay, deadline, late, pose_limits, payload, need, finding,
-                  wrapped=wrapped, tracking_error=tracking_error)  # fmt: skip
+            trajectory = read_trajectory(reference)
+        scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
+                      tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
+                      delay, deadline, late, pose_limits, payload, need, finding,
+                      wrapped=wrapped, tracking_error=tracking_error)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",
@@ -315,25 +325,3 @@ def _pose_limits(table: Table, robot: Robot) -> PoseLimits:
         table.number("rod_margin", _LEAST_ROD_MARGIN, minimum=0.0, maximum=0.9) or None,
         table.number("stiffness", softness, minimum=0.0) or None,
     )
-
-
-def _trajectory(table: Table) -> Trajectory | None:
-    kind = table.text("kind", choices=("none", "hold", "lemniscate", "pick_and_place"))
-    if kind == "hold":
-        return Hold(table.vector("position", 2))
-    if kind == "lemniscate":
-        return Lemniscate(
-            centre=table.vector("centre", 2),
-            size=table.vector("size", 2),
-            period=table.number("period", above=0.0),
-            ramp=table.number("ramp", above=0.0),
-        )
-    if kind == "pick_and_place":
-        return PickAndPlace(
-            pick=table.vector("pick", 2),
-            place=table.vector("place", 2),
-            lift=table.number("lift"),
-            wait=table.number("wait", minimum=0.0),
-            move=table.number("move", above=0.0),
-        )
-    return None

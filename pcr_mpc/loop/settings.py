@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import check_numbers
 from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
 from ..plant.inertia import INERTIAS
 from ..plant.robot import Robot
@@ -86,6 +87,9 @@ class Need:
     plant_step: float
     control_step: float
 
+    def __post_init__(self) -> None:
+        check_numbers(self, {key: {"above": 0.0} for key in ("tip_accuracy", "plant_step", "control_step")})
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -121,6 +125,10 @@ class Payload:
     mass: float
     pick: float
     place: float
+
+    def __post_init__(self) -> None:
+        check_numbers(self, {"mass": {"above": 0.0}, "pick": {"minimum": 0.0}})
+        check_numbers(self, {"place": {"above": self.pick}})
 
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Mass that the tip carries from the times t on [kg], same shape."""

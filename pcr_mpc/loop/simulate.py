@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from .. import interrupt
 from ..control.tuning import Tuning
-from ..errors import SimulationError
+from ..errors import SimulationError, checked_array, checked_vector
 from ..plant.robot import Robot
 from .controllers import Controller
 from .feasibility import reference_excess
 from .feed_forward import InverseDynamics
+from .foreign_parts import check_parts
 from .record import versions
 from .run import Run
 from .scene import Scene
@@ -60,21 +62,27 @@ def simulate(
     ModelError
         The start cannot be held (see `Scene.start`).
     SimulationError
-        The plant or the controller failed, or the run was interrupted; its ``run`` holds everything until
-        then, and its ``__cause__`` is the failure.
+        The plant or the controller failed, in whatever way, or the run was interrupted; its ``run`` holds everything
+        until then, and its ``__cause__`` is the failure.
+    ValueError
+        Before the start: names what plant or controller lack.
     """
+    check_parts(plant, controller, carries=scene.payload is not None)
     per = round(scene.period / plant.dt)
     if per < 1 or abs(per * plant.dt - scene.period) > 1e-9 * scene.period:
         raise ValueError(f"plant.dt = {plant.dt} s does not divide the control period {scene.period} s")
     pose = scene.start()
     x = np.concatenate([pose.p, scene.start_velocity, pose.q])
+    n_periods, n = scene.n_periods, scene.robot.n_rods
+    # Before the start, lest the record of a whole run fails for it.
+    wanted = _reference(scene, plant.dt * np.arange(n_periods * per + 1))
     plant.reset(x, pose)
     controller.start(pose)
+    interrupt.check()
     noise = np.random.default_rng(seed)
     # Rates, how many steps late they come, and what the plan foresaw for the period after.
     still = np.zeros(scene.robot.n_rods)
     on_the_way = deque([(still, 0, still)] * scene.delay)
-    n_periods, n = scene.n_periods, scene.robot.n_rods
 
     states = np.empty((n_periods * per + 1, len(x)))
     inputs = np.empty((n_periods, n))
@@ -103,7 +111,6 @@ def simulate(
 
     def record() -> Run:
         t = plant.dt * np.arange(done + 1)
-        reference = np.full((done + 1, 2), np.nan) if scene.trajectory is None else scene.trajectory(t)[:, 0]
         return Run(
             scene=scene,
             controller=controller.name,
@@ -113,7 +120,7 @@ def simulate(
             dt=plant.dt,
             t=t,
             x=states[: done + 1].copy(),
-            reference=reference,
+            reference=wanted[: done + 1].copy(),
             u=inputs[:decided].copy(),
             plant_time=plant_time[:done].copy(),
             control_time=control_time[:decided].copy(),
@@ -135,6 +142,7 @@ def simulate(
 
     try:
         for k in tqdm(range(n_periods), desc=scene.name, unit="period", disable=not progress):
+            interrupt.check()
             measured = x.copy()
             if scene.tip_noise:
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
@@ -147,7 +155,8 @@ def simulate(
             decision = controller.step(k, measured)
             control_time[k, 0] = time.perf_counter() - began
             control_time[k, 5] = time.thread_time() - began_cpu
-            inputs[k] = decision.u
+            # Named here: NumPy would spread one number over all motors.
+            inputs[k] = checked_vector("the controller's u", decision.u, n)
             if decision.estimate is not None:
                 estimates[k] = decision.estimate
             if decision.force is not None:
@@ -182,6 +191,7 @@ def simulate(
             on_the_way.append((decision.u, late, after))
             arrived, waiting, after = on_the_way.popleft()
             for j in range(per):
+                interrupt.check()
                 u = meanwhile if j < waiting else arrived
                 if done in changes:
                     x = plant.carry(float(payloads[done]), x)
@@ -202,7 +212,7 @@ def simulate(
                     )
                 snapped = len(plant.snaps)
             meanwhile = after
-    except (Exception, KeyboardInterrupt) as error:  # whatever it is, the run so far is kept
+    except BaseException as error:  # whatever it is, a foreign controller's sys.exit() too, the run so far is kept
         what = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
         t = done * plant.dt
         events.append({"t": t, "kind": "failure", "message": what})
@@ -210,3 +220,10 @@ def simulate(
             f"{scene.name} stopped at t = {t:.4f} s of {scene.duration} s: {what}", run=record(), t=t
         ) from error
     return record()
+
+
+def _reference(scene: Scene, t: np.ndarray) -> np.ndarray:
+    """Wanted tip positions at the times t, shape (len(t), 2) [m]; NaN if there is nothing to track."""
+    if scene.trajectory is None:
+        return np.full((len(t), 2), np.nan)
+    return checked_array("what the scene's trajectory returns", scene.trajectory(t), (len(t), 3, 2))[:, 0]

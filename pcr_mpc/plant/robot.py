@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, UnreachableError, checked_number, checked_vector
+from ..errors import ModelError, UnreachableError, check_numbers, checked_number, checked_vector
+from ..files import name_problem
 from ..frozen import Frozen, read_only
 from ..toml_table import read_toml
 
@@ -75,12 +76,12 @@ class Rod:
     axial_stiffness: float = math.inf
 
     def __post_init__(self) -> None:
-        _check_numbers(self, _ROD_NUMBERS)
+        check_numbers(self, _ROD_NUMBERS)
         lowest, highest = _STIFFNESS_RANGE
         _check_profile(self, "curvature", minimum=-1e30, maximum=1e30)
         _check_profile(self, "stiffness_factors", minimum=lowest, maximum=highest)
         if self.axial_stiffness != math.inf:
-            _check_numbers(self, {"axial_stiffness": _POSITIVE})
+            check_numbers(self, {"axial_stiffness": _POSITIVE})
         for name in ("base", "angle_limits"):
             pair = checked_vector(name, getattr(self, name), 2)
             object.__setattr__(self, name, tuple(pair.tolist()))
@@ -138,7 +139,9 @@ class Robot(Frozen):
     gravity: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        _check_numbers(self, _ROBOT_NUMBERS)
+        if problem := name_problem(self.name):
+            raise ModelError(f"name: {problem}", key="name")
+        check_numbers(self, _ROBOT_NUMBERS)
         object.__setattr__(self, "gravity", tuple(checked_vector("gravity", self.gravity, 2).tolist()))
         object.__setattr__(self, "rods", tuple(self.rods))
         for rod in self.rods:
@@ -269,14 +272,6 @@ def _check_profile(rod: Rod, key: str, *, minimum: float, maximum: float) -> Non
             object.__setattr__(rod, key, number if key == "curvature" else (number,))
     except ValueError as error:
         raise ModelError(str(error), key=key) from None
-
-
-def _check_numbers(instance: Any, bounds: dict[str, dict[str, float]]) -> None:
-    for name, bound in bounds.items():
-        try:
-            object.__setattr__(instance, name, checked_number(name, getattr(instance, name), **bound))
-        except ValueError as error:
-            raise ModelError(str(error), key=name) from None
 
 
 def load_robot(path: str | Path) -> Robot:

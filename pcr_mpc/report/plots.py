@@ -9,10 +9,12 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from tqdm import tqdm
 
+from .. import interrupt
+from ..files import replacing
 from ..loop.run import Run
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
-from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt
+from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt, save_figure
 from .tables import without_rounding
 
 _FRAMES_PER_SECOND = 20
@@ -47,8 +49,7 @@ def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
     axes.set_title(
         f"{eq.robot.name}: mode {eq.mode}, {verdict}\nF = ({force[0]:.3g}, {force[1]:.3g}) N, U = {eq.energy:.4g} J"
     )
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
@@ -67,8 +68,7 @@ def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
                        color="black" if eq.stable else RED)  # fmt: skip
     for axes in panels.flat[len(found) :]:
         axes.set_visible(False)
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
@@ -79,6 +79,7 @@ def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
     # The branch is followed through every tenth state, not jumped to.
     found = {}
     for k in range(len(run.x)):
+        interrupt.check()
         if k in wanted or k % 10 == 0:
             eq = plant.equilibrium(run.x[k]) if k in wanted else None
             if eq is None:
@@ -139,8 +140,7 @@ def plot_run(run: Run, path: Path) -> None:
         },
     )
     figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def plot_error(axes: Any, t: np.ndarray, error_mm: np.ndarray) -> None:
@@ -189,6 +189,7 @@ def animate_run(run: Run, path: Path, progress: bool = False) -> None:
     bar = tqdm(total=len(indices), desc="animation", unit="frame", disable=not progress)
 
     def show(i: int) -> list[Any]:
+        interrupt.check()
         for line, shape in zip(rods, shapes[i], strict=True):
             line.set_data(*shape.T)
         trace.set_data(*run.x[: indices[i] + 1, :2].T)
@@ -198,6 +199,9 @@ def animate_run(run: Run, path: Path, progress: bool = False) -> None:
         return [*rods, trace, tip, clock]
 
     animation = FuncAnimation(figure, show, frames=len(indices), init_func=lambda: [], blit=False)
-    animation.save(path, writer=PillowWriter(fps=_FRAMES_PER_SECOND))
-    bar.close()
-    plt.close(figure)
+    try:
+        with replacing(path) as draft:
+            animation.save(draft, writer=PillowWriter(fps=_FRAMES_PER_SECOND))
+    finally:
+        bar.close()
+        plt.close(figure)

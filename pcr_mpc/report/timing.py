@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt
+from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt, save_figure
 from .tables import table
 
 _FIGURES = ("p50", "p95", "p99", "p99.9", "max")
@@ -90,8 +90,7 @@ def plot_timing(result: dict[str, Any], path: Path) -> None:
     load = f", load {machine['load']:.1f} to {machine['load_after']:.1f}" if machine["load"] is not None else ""
     figure.suptitle(f"{result['scene']}: step times on {machine['usable_cores']} cores of {machine['processor']}{load}")
     figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def _series(histogram: dict[str, Any]) -> list[tuple[str, str, str]]:

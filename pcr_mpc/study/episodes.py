@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import interrupt
 from ..control.tuning import Tuning
 from ..errors import SimulationError, checked_number
 from ..loop.feed_forward import InverseDynamics, feed_forward
@@ -225,8 +226,7 @@ def run_episode(scene: Scene, tuning: Tuning, seed: int, spread: Spread = Spread
         try:
             run = simulate_episode(scene, tuning, seed, spread)
         except SimulationError as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):
-                raise KeyboardInterrupt from error
+            interrupt.pass_on(error)
             run, row["failure"] = error.run, str(error)
         except Exception as error:  # before the first step, as a reference that the believed robot cannot follow
             row["failure"] = f"{type(error).__name__}: {error}"

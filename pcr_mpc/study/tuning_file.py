@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, StudyError
+from ..files import replacing, require_free, stamped
 from ..loop.scene import Scene, load_scene
 
 
@@ -30,23 +31,21 @@ def to_tune(scene_file: Path, start: Path | None = None) -> tuple[Scene, Tuning 
     return (scene.tuned(load_tuning(start)) if start else scene), known
 
 
-def write_tuning(tuning: Tuning, path: Path, comments: Sequence[str]) -> None:
+def write_tuning(tuning: Tuning, path: Path, comments: Sequence[str], *, force: bool = False) -> None:
     """Write a tuning of the linear MPC that reads back as it is, under some lines of comment.
 
     Raises
     ------
     StudyError
         It does not read back as it is; nothing is written.
+    OutputError
+        There is a file that was not written here, or was changed since, and ``force`` is not given.
     """
-    draft = path.with_name(f".{path.name}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        draft.write_text(_toml(tuning, comments), encoding="utf-8")
+    require_free(path, force=force)
+    with replacing(path) as draft:
+        draft.write_text(stamped(_toml(tuning, comments)), encoding="utf-8")
         if not _reads_back(draft, tuning):
             raise StudyError(f"{path}: tuning {tuning} has settings that this version cannot write", path=str(path))
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _reads_back(path: Path, tuning: Tuning) -> bool:
