@@ -7,40 +7,17 @@ import json
 import re
 import sys
 import traceback
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .cli_statics import export, solve_pose
-from .control.tuning import load_tuning
-from .errors import PCRError, SimulationError
-from .loop.model_inertia import by_model_inertia
-from .loop.run import Run
-from .loop.scene import load_scene
-from .loop.simulate import simulate
-from .loop.simulated_plant import SimulatedPlant
-from .loop.tracking import make_controller
-from .plant.mujoco_plant import MuJoCoPlant
-from .plant.statics import METHODS
-from .report.choice_tables import choice_record, choice_table
-from .report.csv_rows import write_rows
-from .report.plots import animate_run, plot_run
-from .report.tables import (
-    summary_table,
-    tuning_comments,
-    tuning_table,
-)
-from .report.timing import plot_timing, timing_tables
-from .report.trade_off import plot_trade_off
-from .study.choice import choose
-from .study.chosen_rung import write_rung
-from .study.episodes import Spread, lighter
-from .study.parallel import local_workers
-from .study.provenance import commit
-from .study.timing import time_scene
-from .study.tuning_file import default_path, to_tune, write_tuning
-from .study.tuning_space import Search
-from .study.tuning_study import finished_trials, tune
+from .methods import METHODS
+
+if TYPE_CHECKING:
+    from .loop.run import Run
+
+# The rest is loaded by the command that needs it, what reads its files first: an error need not wait for all.
 
 _EXAMPLES = """\
 examples:
@@ -63,17 +40,42 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    from .errors import PCRError, described
+
     try:
         status: int = options.run(options)
         return status
     except (PCRError, ValueError, OSError, MemoryError) as error:
         if options.traceback:
             traceback.print_exc()
-        print(f"pcr-mpc: {error}", file=sys.stderr)
+        print(f"pcr-mpc: {described(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interrupt:
         print(f"pcr-mpc: {str(interrupt) or 'interrupted'}", file=sys.stderr)
         return 130
+
+
+class _Version(argparse.Action):
+    """Looks the version up only where it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from importlib.metadata import version
+
+        print(f"pcr-mpc {version('pcr_mpc')}")
+        parser.exit()
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    def whole_number(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"is {text}, expected a whole number of at least {least}")
+        return value
+
+    return whole_number
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -83,6 +85,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(name: str, run: Any, text: str) -> argparse.ArgumentParser:
@@ -99,14 +102,14 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("--controller", type=Path, help="controller tuning instead of the scene's own")
     track.add_argument("--method", choices=METHODS, help="statics of the plant instead of the scene's own")
     track.add_argument("--plant", choices=("mujoco",), help="simulate the robot with MuJoCo instead (extra 'mujoco')")
-    track.add_argument("--links", type=int, help="of each rod, with --plant mujoco (default 40)")
-    track.add_argument("--seed", type=int, default=0, help="of the measurement noise (default 0)")
+    track.add_argument("--links", type=_at_least(2), help="of each rod, with --plant mujoco (default 40)")
+    track.add_argument("--seed", type=_at_least(0), default=0, help="of the measurement noise (default 0)")
     track.add_argument("--out", type=Path, help="folder for the results (default results/NAME)")
     track.add_argument("--no-pictures", action="store_true", help="write the record only")
 
     statics = command(
         "statics",
-        solve_pose,
+        _statics,
         "Solve a pose: give --p and --q, or one of them to find the other in balance with --force.",
     )
     statics.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
@@ -125,11 +128,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     statics.add_argument("--picture", type=Path, metavar="FILE", help="draw the pose into FILE")
 
-    mjcf = command("export", export, "Write a robot in balance as a model file of MuJoCo (MJCF).")
+    mjcf = command("export", _export, "Write a robot in balance as a model file of MuJoCo (MJCF).")
     mjcf.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
     mjcf.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), required=True, help="tip position [m]")
     mjcf.add_argument("--mode", help="working mode, a letter L or R per rod, such as LR")
-    mjcf.add_argument("--links", type=int, default=_LINKS, help=f"of each rod (default {_LINKS})")
+    mjcf.add_argument("--links", type=_at_least(2), default=_LINKS, help=f"of each rod (default {_LINKS})")
     mjcf.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file, such as planar_pair.xml")
 
     choice = command(
@@ -144,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
         "timing", _timing, "Time plant steps of every method and the control step against their budgets; draw it."
     )
     timing.add_argument("scene", type=Path, help="scene file")
-    timing.add_argument("--steps", type=int, default=100_000,
+    timing.add_argument("--steps", type=_at_least(1), default=100_000,
                         help="plant steps and control steps (default 100000: two or three minutes)")  # fmt: skip
     timing.add_argument("--out", type=Path, help="folder for the results (default results/timing/NAME)")
 
@@ -157,21 +160,36 @@ def _parser() -> argparse.ArgumentParser:
     tuning.add_argument("scene", type=Path, help="scene file")
     tuning.add_argument("--start", type=Path, metavar="FILE", help="tuning to beat (default: the scene's; default.toml "
                         "beside it if that is from an earlier search)")  # fmt: skip
-    tuning.add_argument("--trials", type=int, default=50, help="to add to the study (default 50)")
-    tuning.add_argument("--jobs", type=int, default=1, help="processes on this machine (default 1)")
+    tuning.add_argument("--trials", type=_at_least(1), default=50, help="to add to the study (default 50)")
+    tuning.add_argument("--jobs", type=_at_least(1), default=1, help="processes on this machine (default 1)")
     tuning.add_argument("--storage", metavar="URL", help="Optuna storage, for several machines "
                       "(default SQLite in results/tune/SCENE)")  # fmt: skip
-    tuning.add_argument("--episodes", type=int, default=24, help="with mismatch, in each trial (default 24: a "
+    tuning.add_argument("--episodes", type=_at_least(1), default=24, help="with mismatch, in each trial (default 24: a "
                         "study that sees no failure, which is rare, takes a fragile tuning for the best)")  # fmt: skip
     tuning.add_argument("--keep-period", action="store_true", help="the control period is given: search the rest")
-    tuning.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
+    tuning.add_argument("--seed", type=_at_least(0), default=0, help="of the first episode (default 0)")
     tuning.add_argument(
         "--out", type=Path, metavar="FILE", help="tuning to write (default SCENE.toml beside the scene's)"
     )
     return parser
 
 
+def _statics(options: argparse.Namespace) -> int:
+    from .cli_statics import solve_pose
+
+    return solve_pose(options)
+
+
+def _export(options: argparse.Namespace) -> int:
+    from .cli_statics import export
+
+    return export(options)
+
+
 def _track(options: argparse.Namespace) -> int:
+    from .control.tuning import load_tuning
+    from .loop.scene import load_scene
+
     scene = load_scene(options.scene)
     tuning = load_tuning(options.controller) if options.controller else None
     if tuning and scene.trajectory is None:
@@ -182,6 +200,14 @@ def _track(options: argparse.Namespace) -> int:
         raise ValueError("--method has no use with --plant: MuJoCo solves no statics")
     if options.links is not None and not options.plant:
         raise ValueError("--links goes with --plant mujoco")
+    from .errors import SimulationError
+    from .loop.model_inertia import by_model_inertia
+    from .loop.simulate import simulate
+    from .loop.simulated_plant import SimulatedPlant
+    from .loop.tracking import make_controller
+    from .plant.mujoco_plant import MuJoCoPlant
+    from .report.tables import summary_table
+
     plant: SimulatedPlant = scene.make_plant()
     if options.plant:
         plant = MuJoCoPlant(scene.robot, links=_LINKS if options.links is None else options.links, dt=scene.plant.dt)
@@ -210,6 +236,8 @@ def _track(options: argparse.Namespace) -> int:
 
 
 def _pictures(run: Run, folder: Path) -> dict[str, str]:
+    from .report.plots import animate_run, plot_run
+
     picture, animation = folder / "track.png", folder / "track.gif"
     plot_run(run, picture)
     animate_run(run, animation, progress=True)
@@ -217,7 +245,15 @@ def _pictures(run: Run, folder: Path) -> dict[str, str]:
 
 
 def _choose(options: argparse.Namespace) -> int:
-    choice = choose(load_scene(options.scene), progress=True)
+    from .loop.scene import load_scene
+
+    scene = load_scene(options.scene)
+
+    from .report.choice_tables import choice_record, choice_table
+    from .study.choice import choose
+    from .study.chosen_rung import write_rung
+
+    choice = choose(scene, progress=True)
     print(json.dumps(choice_record(choice)) if options.json else f"\n{choice_table(choice)}")
     if options.write:
         write_rung(choice, options.scene)
@@ -226,9 +262,13 @@ def _choose(options: argparse.Namespace) -> int:
 
 
 def _timing(options: argparse.Namespace) -> int:
+    from .loop.scene import load_scene
+
     scene = load_scene(options.scene)
-    if options.steps < 1:
-        raise ValueError(f"--steps is {options.steps}, expected at least 1")
+
+    from .report.timing import plot_timing, timing_tables
+    from .study.timing import time_scene
+
     folder = options.out or Path("results") / "timing" / scene.name
     folder.mkdir(parents=True, exist_ok=True)
     result = time_scene(scene, options.steps, progress=True)
@@ -240,10 +280,19 @@ def _timing(options: argparse.Namespace) -> int:
 
 
 def _tune(options: argparse.Namespace) -> int:
+    from .study.tuning_file import default_path, to_tune, write_tuning
+
     scene, known = to_tune(options.scene, options.start)
-    for name in ("trials", "jobs", "episodes"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"--{name} is {getattr(options, name)}, expected at least 1")
+
+    from .report.csv_rows import write_rows
+    from .report.tables import tuning_comments, tuning_table
+    from .report.trade_off import plot_trade_off
+    from .study.episodes import Spread, lighter
+    from .study.parallel import local_workers
+    from .study.provenance import commit
+    from .study.tuning_space import Search
+    from .study.tuning_study import finished_trials, tune
+
     folder = Path("results") / "tune" / scene.name
     folder.mkdir(parents=True, exist_ok=True)
     storage = options.storage or f"sqlite:///{folder / 'study.db'}"

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from .errors import ModelError, number_problem
+from .errors import ModelError, described, number_problem
 
 _REQUIRED: Any = object()
 
@@ -150,10 +150,12 @@ def read_toml(path: str | Path) -> Table:
     """
     path = Path(os.path.normpath(path))
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise ModelError(f"{path}: no such file", file=str(path)) from None
+    except OSError as error:
+        raise ModelError(described(error) if error.filename else f"{path}: {error}", file=str(path)) from error
     # ValueError: not UTF-8, not TOML, or an integer of thousands of digits; RecursionError: thousands of brackets.
-    except (OSError, ValueError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ModelError(f"{path}: {error}", file=str(path)) from error
     return Table(path, "", data)

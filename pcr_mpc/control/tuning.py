@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import checked_number
+from ..errors import checked_integer, checked_number
+from ..methods import METHODS
 from ..toml_table import read_toml
 from .observer import ObserverTuning
 
-METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 SCHEMES = ("rk4", "rk8")
 LAWS = ("linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward")
 LINEARISE = ("here", "along_plan")
@@ -93,14 +93,13 @@ class Tuning:
 
     def __post_init__(self) -> None:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+            object.__setattr__(self, name, checked_integer(name, count))
         if self.law not in LAWS:
             raise ValueError(f"law is {self.law!r}, expected one of {', '.join(LAWS)}")
         for name in ("position_weight", "input_weight", "tolerance"):
-            checked_number(name, getattr(self, name), above=0.0)
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), above=0.0))
         for name in ("velocity_weight", "angle_weight"):
-            checked_number(name, getattr(self, name), minimum=0.0)
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), minimum=0.0))
         if self.fallback not in FALLBACKS:
             raise ValueError(f"fallback is {self.fallback!r}, expected one of {', '.join(FALLBACKS)}")
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ConvergenceError, checked_vector
+from ..methods import METHODS
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod import SCHEMES
@@ -26,7 +27,6 @@ _TAUT = 0.05
 _STRETCH = 5e-4  # least slack that counts for a rod that stretches
 # Integration steps along a rod for which a graph may be built: half a minute and 1 GB.
 _MOST_STEPS = 1024
-METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 
 
 def solve_statics(
