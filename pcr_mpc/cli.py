@@ -41,8 +41,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     from .errors import PCRError, described
+    from .toml_table import read_toml
 
     try:
+        for name in ("scene", "robot", "controller", "start"):
+            if path := getattr(options, name, None):
+                read_toml(path)  # the commonest error, before the rest is loaded
         status: int = options.run(options)
         return status
     except (PCRError, ValueError, OSError, MemoryError) as error:
