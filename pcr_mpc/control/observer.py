@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
+from ..errors import checked_number
 from ..linearisation.linear_model import LinearModel
 
 
@@ -27,6 +28,10 @@ class ObserverTuning:
     tip_noise: float = 1e-5
     force_noise: float = 0.01
     force_walk: float = 0.005
+
+    def __post_init__(self) -> None:
+        for name in ("tip_noise", "force_noise", "force_walk"):
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), above=0.0))
 
 
 class DisturbanceObserver:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import checked_integer, checked_number
+from ..errors import checked_integer, checked_number, checked_vector
 from ..methods import METHODS
 from ..toml_table import read_toml
 from .observer import ObserverTuning
@@ -45,6 +45,17 @@ class Model:
     linearise: str = "here"
     payload: bool = True
     predict_delay: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("segments", "steps"):
+            object.__setattr__(self, name, checked_integer(name, getattr(self, name)))
+        for name, choices in (
+            ("method", METHODS),
+            ("scheme", SCHEMES),
+            ("inertia", INERTIAS),
+            ("linearise", LINEARISE),
+        ):
+            _check_choice(name, getattr(self, name), choices)
 
 
 @dataclass(frozen=True)
@@ -94,14 +105,20 @@ class Tuning:
     def __post_init__(self) -> None:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
             object.__setattr__(self, name, checked_integer(name, count))
-        if self.law not in LAWS:
-            raise ValueError(f"law is {self.law!r}, expected one of {', '.join(LAWS)}")
+        _check_choice("law", self.law, LAWS)
         for name in ("position_weight", "input_weight", "tolerance"):
             object.__setattr__(self, name, checked_number(name, getattr(self, name), above=0.0))
         for name in ("velocity_weight", "angle_weight"):
             object.__setattr__(self, name, checked_number(name, getattr(self, name), minimum=0.0))
-        if self.fallback not in FALLBACKS:
-            raise ValueError(f"fallback is {self.fallback!r}, expected one of {', '.join(FALLBACKS)}")
+        _check_choice("fallback", self.fallback, FALLBACKS)
+        object.__setattr__(self, "pd", tuple(checked_vector("pd", self.pd, 2).tolist()))
+        if self.period is not None:
+            object.__setattr__(self, "period", checked_number("period", self.period, above=0.0))
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +14,13 @@ from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import inverse_statics
 from ..plant.robot import Robot
 from .scene import Scene
+from .trajectory import sampled
 
 # The motor angles' change by the rods' inertia is found again from the angles that it leads to, until it settles [rad]:
 # each time the error falls as the rods' share of the mass, 1/200 of the change on the default robot.
 _SETTLED = 1e-5
 _MOST_SWEEPS = 20
+_SHARE_RESOLUTION = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,25 +68,27 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     Raises
     ------
     PCRError
-        The reference leaves the workspace; the message says when.
+        The reference leaves the workspace, or asks for more force than the rods can give; the message says when, and
+        of what acceleration to take how much less.
     ConvergenceError
         The inertia of the rods changes the angles too much for the fixed point.
     """
     assert scene.trajectory is not None
     t = scene.period * np.arange(scene.n_periods + horizon + 1)
-    p, v, a = np.moveaxis(scene.trajectory(t), 1, 0)
+    p, v, a = np.moveaxis(sampled(scene.trajectory, t), 1, 0)
     carried = scene.carried(t)
     # Mass and weight of what is carried, which has nothing to do with the rods.
     loads = carried[:, None] * (np.array(robot.gravity) - a)
     forces = loads - robot.tip_mass * a - robot.drag * v
-    q, levers = _angles(robot, pose, t, p, forces)
+    resting = carried[:, None] * np.array(robot.gravity)
+    q, levers = _angles(robot, pose, t, p, forces, resting, a)
     if inertia != "none":
         plant = Plant(robot, inertia=inertia)
         for _ in range(_MOST_SWEEPS):
             plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
             momentum, push, own = _momentum(plant, carried, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
             forces = loads + push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
-            before, (q, levers) = q, _angles(robot, pose, t, p, forces)
+            before, (q, levers) = q, _angles(robot, pose, t, p, forces, resting, a)
             change = float(np.abs(q - before).max())
             if change < _SETTLED:
                 break
@@ -102,19 +107,54 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
 
 
 def _angles(
-    robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray
+    robot: Robot,
+    pose: Equilibrium,
+    t: np.ndarray,
+    p: np.ndarray,
+    forces: np.ndarray,
+    resting: np.ndarray,
+    accelerations: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motor angles at which the rods carry the forces at the tips p, (K, n) [rad], and their change by one more newton,
-    (K, n, 2) [rad/N]."""
+    (K, n, 2) [rad/N]; ``resting`` is what they would carry at rest [N]."""
     angles, levers, eq = np.empty((len(t), robot.n_rods)), np.empty((len(t), robot.n_rods, 2)), pose
     for k in range(len(t)):
         try:
             eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
-            raise type(error)(f"reference at t = {t[k]:.3f} s: {error}", **error.details) from None
+            fast = ""
+            if share := _share_of_motion(robot, eq, p[k], forces[k], resting[k]):
+                slower = math.ceil(10.0 / math.sqrt(share)) / 10.0
+                fast = (
+                    f"it asks for an acceleration of {math.hypot(*accelerations[k]):.3g} m/s^2, and the rods, which "
+                    f"could rest there, can give {100 * share:.0f} % of the force that its motion takes; smooth it, or "
+                    f"make it slower by a factor of at least {slower:g}: "
+                )
+            raise type(error)(f"reference at t = {t[k]:.3f} s: {fast}{error}", **error.details) from None
         angles[k] = eq.q
         levers[k] = np.linalg.pinv(eq.dforce_dq)
     return angles, levers
+
+
+def _share_of_motion(
+    robot: Robot, before: Equilibrium, p: np.ndarray, force: np.ndarray, resting: np.ndarray
+) -> float | None:
+    """Share of ``force`` beyond ``resting`` that the rods can carry at p; None if they cannot even rest there."""
+
+    def possible(share: float) -> bool:
+        try:
+            inverse_statics(robot, p, resting + share * (force - resting), guess=before)
+        except PCRError:
+            return False
+        return True
+
+    if np.array_equal(force, resting) or not possible(0.0):
+        return None
+    low, high = 0.0, 1.0
+    while high - low > _SHARE_RESOLUTION:
+        middle = (low + high) / 2
+        low, high = (middle, high) if possible(middle) else (low, middle)
+    return low or high
 
 
 def _momentum(

@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import PCRError
 from ..frozen import freeze
+from ..plain import plain
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from .finding import verified
@@ -168,8 +169,8 @@ class Run:
             "scene": self.scene.name,
             "controller": self.controller,
             "plant": self.plant,
-            "rung": None if self.rung is None else asdict(self.rung),
-            "need": self._need(),
+            "rung": plain(self.rung),
+            "need": plain(self._need()),
             "seed": self.seed,
             "duration_s": float(self.t[-1]),
             "rms_mm": _rms(error_mm) if tracked else None,
@@ -215,7 +216,7 @@ class Run:
         np.savez_compressed(
             files["run.npz"], t=self.t, x=self.x, u=self.u, reference=self.reference, plant_time=self.plant_time,
             control_time=self.control_time, iterations=self.iterations,
-            rung=json.dumps(self.rung and asdict(self.rung)), need=json.dumps(self._need()),
+            rung=json.dumps(plain(self.rung)), need=json.dumps(plain(self._need())),
         )  # fmt: skip
         n = self.scene.robot.n_rods
         per = self.steps_per_period

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ..errors import SimulationError
+from ..errors import SimulationError, checked_integer
 from .controllers import Controller
 from .run import Run
 from .scene import Scene
@@ -54,6 +54,7 @@ def simulate(
         The plant or the controller failed, or the run was interrupted; its ``run`` holds everything until
         then, and its ``__cause__`` is the failure.
     """
+    seed = checked_integer("seed", seed, minimum=0)
     per = round(scene.period / plant.dt)
     if per < 1 or abs(per * plant.dt - scene.period) > 1e-9 * scene.period:
         raise ValueError(f"plant.dt = {plant.dt} s does not divide the control period {scene.period} s")
