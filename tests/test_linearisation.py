@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from experiments.finite_differences import error_curve
-from pcr_mpc import Plant, linearise, load_robot
+from pcr_mpc import Plant, inverse_statics, linearise, load_robot
 
 from .conftest import MODELS
 
@@ -85,8 +85,8 @@ def differences(plant, pose, x, u):
         plant.reset(x, pose)  # which is where the inertia is constant
         return plant.step(y, w)
 
-    a = [(step(x + h, u) - step(x - h, u)) / 2e-4 for h in 1e-4 * np.eye(6)]
-    b = [(step(x, u + h) - step(x, u - h)) / 2e-4 for h in 1e-4 * np.eye(2)]
+    a = [(step(x + h, u) - step(x - h, u)) / 2e-4 for h in 1e-4 * np.eye(len(x))]
+    b = [(step(x, u + h) - step(x, u - h)) / 2e-4 for h in 1e-4 * np.eye(len(u))]
     return np.array(a).T, np.array(b).T
 
 
@@ -159,13 +159,27 @@ def test_models_do_not_share_memory(pair, centre):
     assert (first.A == kept).all()
 
 
-def test_three_rods(poses):
-    robot = load_robot(MODELS / "three_rods.toml")
-    plant = Plant(robot)
-    x = np.array([0.0, 0.115, 0, 0, 1.92, 4.02, -0.17])
-    plant.reset(x)
-    model = linearise(plant, x, np.zeros(3), 0.01)
-    assert (model.A.shape, model.B.shape, model.c.shape) == ((7, 7), (7, 3), (7,))
+def test_three_rods():
+    """Against differences of a step, out of balance."""
+    robot, dt = load_robot(MODELS / "three_rods.toml"), 5e-4
+    pose = inverse_statics(robot, (0.0, 0.115), mode="LLL")
+    plant = Plant(robot, integrator="rk4", dt=dt)
+    x, u = np.concatenate([pose.p + [0.01, -0.005], [0.05, -0.1], pose.q + [0.1, -0.1, 0.05]]), np.zeros(3)
+    plant.reset(x, pose)
+    model = linearise(plant, x, u, dt)
+    a, b = differences(plant, pose, x, u)
+    size = np.abs(a - np.eye(7))[2:4, [0, 1, 4, 5, 6]].max()
+    assert np.abs(model.A - a)[2:4].max() < 1e-3 * size
+    assert np.abs(model.A - a)[[0, 1, 4, 5, 6]].max() < 1e-3 * dt
+    assert np.abs(model.B - b)[:2].max() < 1e-3 * np.abs(b[:2]).max()
+    assert np.abs(model.B - b)[2:4].max() < 1e-3 * dt * size
+    assert model.B[4:] == pytest.approx(dt * np.eye(3), abs=1e-15)
+    assert model(x, u) == pytest.approx(plant_step(plant, pose, x, u), abs=1e-3 * dt * np.abs(x[2:4]).max())
+
+
+def plant_step(plant, pose, x, u):
+    plant.reset(x, pose)
+    return plant.step(x, u)
 
 
 def test_effect_of_a_force(pair, centre):

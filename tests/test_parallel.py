@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,12 +10,14 @@ import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from pcr_mpc import load_scene
 from pcr_mpc.errors import StudyError
+from pcr_mpc.study import provenance
 from pcr_mpc.study.episodes import EXACT, Spread, run_episode
 from pcr_mpc.study.parallel import collect, finished, local_workers
 from pcr_mpc.study.provenance import commit, described, differences, source_digest
@@ -251,6 +254,37 @@ def test_settings_name_what_differs(scene):
     assert all(line.startswith("spread.") for line in changed)
 
 
-def test_code_and_commit_are_named():
-    assert len(source_digest()) == 12
-    assert commit()
+def test_the_digest_is_of_all_code_and_of_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.setattr(provenance, "_PACKAGE", tmp_path)
+    (tmp_path / "study").mkdir()
+    digests = []
+    for name, text in (("a.py", "1"), ("study/b.py", "1"), ("a.py", "2"), ("study/b.py", "2")):
+        (tmp_path / name).write_text(text)
+        digests.append(source_digest())
+    (tmp_path / "study/b.py").rename(tmp_path / "b.py")
+    digests.append(source_digest())
+    assert len(set(digests)) == 5
+    (tmp_path / "notes.md").write_text("something")
+    assert source_digest() == digests[-1]
+    assert all(re.fullmatch("[0-9a-f]{12}", one) for one in digests)
+
+
+def test_the_commit_is_that_of_the_code(tmp_path, monkeypatch):
+    def git(*arguments):
+        person = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        done = subprocess.run(["git", *person, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    package = tmp_path / "pcr_mpc"
+    package.mkdir()
+    monkeypatch.setattr(provenance, "_PACKAGE", package)
+    (package / "errors.py").write_text("1")
+    git("init", "-q")
+    assert commit() == f"version {version('pcr_mpc')}"  # somebody else's repository
+    git("add", ".")
+    git("commit", "-qm", "first")
+    assert commit() == git("rev-parse", "HEAD")[:12]
+    (tmp_path / "README.md").write_text("not code")
+    assert commit() == git("rev-parse", "HEAD")[:12]
+    (package / "errors.py").write_text("2")
+    assert commit() == git("rev-parse", "HEAD")[:12] + "-dirty"

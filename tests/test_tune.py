@@ -112,7 +112,7 @@ def test_costs_are_those_of_the_episodes(scene):
     assert changed.tracking_mm != same.tracking_mm
     assert measure(scene, start, start, [0], EXACT).tracking_mm == same.nominal_mm
     # Not even begun: all is lost, and nothing is raised.
-    lost = measure(scene, start, replace(start, model=replace(start.model, segments=-1, method="multiple_shooting")),
+    lost = measure(scene, start, replace(start, model=replace(start.model, segments=10**6, method="multiple_shooting")),
                    [0], Spread())  # fmt: skip
     assert lost.failure_rate == 1.0
     assert lost.tracking_mm == np.inf
@@ -358,7 +358,7 @@ def test_a_scene_that_was_tuned_is_tuned_from_the_default_again(tmp_path, monkey
         searches.append(search)
         raise PCRError("enough")
 
-    monkeypatch.setattr("pcr_mpc.cli.tune", stopped)
+    monkeypatch.setattr("pcr_mpc.study.tuning_study.tune", stopped)
     assert main(["tune", str(scene)]) == 1
     assert main(["tune", str(scene), "--start", str(CONTROLLERS / "slow_motors.toml")]) == 1
     assert main(["tune", str(MODELS / "scenes/limited.toml"), "--start", str(CONTROLLERS / "default.toml")]) == 1
@@ -369,8 +369,8 @@ def test_a_scene_that_was_tuned_is_tuned_from_the_default_again(tmp_path, monkey
 
 def test_tune_without_success_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pcr_mpc.cli.tune", lambda *_: None)
-    monkeypatch.setattr("pcr_mpc.cli.finished_trials", lambda _: [
+    monkeypatch.setattr("pcr_mpc.study.tuning_study.tune", lambda *_: None)
+    monkeypatch.setattr("pcr_mpc.study.tuning_study.finished_trials", lambda _: [
         {"trial": 0, "score": 1.0, **START.row()}, {"trial": 1, "score": 1.5, **START.row()}])  # fmt: skip
     out = tmp_path / "tuned.toml"
     assert main(["tune", str(MODELS / "scenes/lemniscate.toml"), "--trials", "1", "--out", str(out)]) == 0
