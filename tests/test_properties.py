@@ -51,11 +51,11 @@ def count():
     """Of cases, and of those that came to the assertion: most, or the test says nothing."""
     counted = Counter()
     yield counted
-    assert counted["reached"] > 0.5 * counted["cases"], counted
+    assert counted["reached"] > 0.6 * counted["cases"] > 0, counted
 
 
 def mostly(ordinary, *others):
-    return st.one_of(*[ordinary] * 3 * len(others), *others)
+    return st.integers(0, 7).flatmap(lambda k: others[k] if k < len(others) else ordinary)
 
 
 strange = st.sampled_from([0.0, -0.0, 5e-324, 1e-300, -1e-9, 1e8, 1e200, -1e200, math.inf, -math.inf, math.nan])
@@ -203,7 +203,7 @@ spoiled = mostly(
 )
 
 
-@cases(100)
+@cases(40)
 @given(st.lists(rods, min_size=1, max_size=3), numbers, spoiled)
 def test_robots_are_sound_or_refused(count, rods, numbers, spoiled):
     if spoiled is not None:
@@ -222,12 +222,11 @@ def test_robots_are_sound_or_refused(count, rods, numbers, spoiled):
     assert robot.tip_mass > 0
     assert robot.drag >= 0
     assert np.isfinite([*robot.lengths, *robot.stiffnesses, robot.tip_mass, robot.drag, robot.rate_limit]).all()
-    for centre in robot.bases:
-        at = centre + 0.3 * robot.lengths.min()
-        if min(robot.slacks(at)) > 0.0 and 1e-9 < robot.stiffnesses.min() and robot.stiffnesses.max() < 1e6:
-            eq = checked(lambda at=at: solve_statics(robot, at, np.ones(robot.n_rods)))
-            if eq is not None:
-                require_equilibrium(eq)
+    at = robot.bases[0] + 0.3 * robot.lengths.min()
+    if min(robot.slacks(at)) > 0.0 and 1e-9 < robot.stiffnesses.min() and robot.stiffnesses.max() < 1e6:
+        eq = checked(lambda: solve_statics(robot, at, np.ones(robot.n_rods)))
+        if eq is not None:
+            require_equilibrium(eq)
 
 
 @cases(200)
