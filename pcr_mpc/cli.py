@@ -7,7 +7,6 @@ import json
 import re
 import sys
 import traceback
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +33,8 @@ examples:
 """
 
 _LINKS = 40
+# Least values of the options that are whole numbers.
+_LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -44,6 +45,9 @@ def main(arguments: list[str] | None = None) -> int:
     from .toml_table import read_toml
 
     try:
+        for name, least in _LEAST.items():
+            if (value := getattr(options, name, None)) is not None and value < least:
+                raise ValueError(f"--{name} is {value}, expected at least {least}")
         for name in ("scene", "robot", "controller", "start"):
             if path := getattr(options, name, None):
                 read_toml(path)  # the commonest error, before the rest is loaded
@@ -67,19 +71,6 @@ class _Version(argparse.Action):
 
         print(f"pcr-mpc {version('pcr_mpc')}")
         parser.exit()
-
-
-def _at_least(least: int) -> Callable[[str], int]:
-    def whole_number(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = least - 1
-        if value < least:
-            raise argparse.ArgumentTypeError(f"is {text}, expected a whole number of at least {least}")
-        return value
-
-    return whole_number
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -106,8 +97,8 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("--controller", type=Path, help="controller tuning instead of the scene's own")
     track.add_argument("--method", choices=METHODS, help="statics of the plant instead of the scene's own")
     track.add_argument("--plant", choices=("mujoco",), help="simulate the robot with MuJoCo instead (extra 'mujoco')")
-    track.add_argument("--links", type=_at_least(2), help="of each rod, with --plant mujoco (default 40)")
-    track.add_argument("--seed", type=_at_least(0), default=0, help="of the measurement noise (default 0)")
+    track.add_argument("--links", type=int, help="of each rod, with --plant mujoco (default 40)")
+    track.add_argument("--seed", type=int, default=0, help="of the measurement noise (default 0)")
     track.add_argument("--out", type=Path, help="folder for the results (default results/NAME)")
     track.add_argument("--no-pictures", action="store_true", help="write the record only")
 
@@ -136,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     mjcf.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
     mjcf.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), required=True, help="tip position [m]")
     mjcf.add_argument("--mode", help="working mode, a letter L or R per rod, such as LR")
-    mjcf.add_argument("--links", type=_at_least(2), default=_LINKS, help=f"of each rod (default {_LINKS})")
+    mjcf.add_argument("--links", type=int, default=_LINKS, help=f"of each rod (default {_LINKS})")
     mjcf.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file, such as planar_pair.xml")
 
     choice = command(
@@ -151,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
         "timing", _timing, "Time plant steps of every method and the control step against their budgets; draw it."
     )
     timing.add_argument("scene", type=Path, help="scene file")
-    timing.add_argument("--steps", type=_at_least(1), default=100_000,
+    timing.add_argument("--steps", type=int, default=100_000,
                         help="plant steps and control steps (default 100000: two or three minutes)")  # fmt: skip
     timing.add_argument("--out", type=Path, help="folder for the results (default results/timing/NAME)")
 
@@ -164,14 +155,14 @@ def _parser() -> argparse.ArgumentParser:
     tuning.add_argument("scene", type=Path, help="scene file")
     tuning.add_argument("--start", type=Path, metavar="FILE", help="tuning to beat (default: the scene's; default.toml "
                         "beside it if that is from an earlier search)")  # fmt: skip
-    tuning.add_argument("--trials", type=_at_least(1), default=50, help="to add to the study (default 50)")
-    tuning.add_argument("--jobs", type=_at_least(1), default=1, help="processes on this machine (default 1)")
+    tuning.add_argument("--trials", type=int, default=50, help="to add to the study (default 50)")
+    tuning.add_argument("--jobs", type=int, default=1, help="processes on this machine (default 1)")
     tuning.add_argument("--storage", metavar="URL", help="Optuna storage, for several machines "
                       "(default SQLite in results/tune/SCENE)")  # fmt: skip
-    tuning.add_argument("--episodes", type=_at_least(1), default=24, help="with mismatch, in each trial (default 24: a "
+    tuning.add_argument("--episodes", type=int, default=24, help="with mismatch, in each trial (default 24: a "
                         "study that sees no failure, which is rare, takes a fragile tuning for the best)")  # fmt: skip
     tuning.add_argument("--keep-period", action="store_true", help="the control period is given: search the rest")
-    tuning.add_argument("--seed", type=_at_least(0), default=0, help="of the first episode (default 0)")
+    tuning.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
     tuning.add_argument(
         "--out", type=Path, metavar="FILE", help="tuning to write (default SCENE.toml beside the scene's)"
     )
