@@ -10,7 +10,7 @@ import traceback
 import warnings
 
 from . import interrupt
-from .cli_parser import parser
+from .cli_parser import LEAST, parser
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,6 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     try:
         warnings.formatwarning = lambda message, *_, **__: f"pcr-mpc: warning: {message}\n"
+        _check(options)
         with interrupt.nothing_to_lose():
             module, name = options.run
             command = getattr(importlib.import_module(f"{__package__}.{module}"), name)
@@ -49,15 +50,28 @@ def _run(options: argparse.Namespace) -> int:
         return interrupt.exit_status() if stopped else 1
 
 
+def _check(options: argparse.Namespace) -> None:
+    """Find the commonest errors before anything that takes time is loaded."""
+    for name, least in LEAST.items():
+        if (value := getattr(options, name, None)) is not None and value < least:
+            raise ValueError(f"--{name} is {value}, expected at least {least}")
+    with interrupt.nothing_to_lose():
+        from .toml_table import read_toml
+
+        for name in ("scene", "robot", "controller", "start"):
+            if path := getattr(options, name, None):
+                read_toml(path)
+
+
 def _message(error: BaseException, stopped: bool) -> str:
-    from .errors import PCRError, SimulationError  # which load NumPy
+    from .errors import PCRError, SimulationError, described  # which load NumPy
 
     if stopped:
         return str(error) if isinstance(error, KeyboardInterrupt | SimulationError) and str(error) else "interrupted"
     if isinstance(error, MemoryError):
         return f"out of memory: {error}".rstrip(": ")
     if isinstance(error, PCRError | ValueError | OSError):
-        return str(error)
+        return described(error)
     return f"{type(error).__name__}: {error}; --traceback shows where"
 
 

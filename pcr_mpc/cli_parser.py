@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
+from typing import Any
+
+from .methods import METHODS
 
 _EXAMPLES = """\
 examples:
@@ -21,7 +24,18 @@ examples:
 """
 
 LINKS = 40
-METHODS = ("closed_form", "multiple_shooting", "single_shooting")
+# Least values of the options that are whole numbers.
+LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1}
+
+
+class _Version(argparse.Action):
+    """Looks the version up only where it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from importlib.metadata import version
+
+        print(f"pcr-mpc {version('pcr_mpc')}")
+        parser.exit()
 
 
 def parser() -> argparse.ArgumentParser:
@@ -32,6 +46,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    top.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
 
     def command(name: str, module: str, run: str, text: str) -> argparse.ArgumentParser:

@@ -15,8 +15,6 @@ from .plant.mjcf import mjcf
 from .plant.robot import Robot, load_robot
 from .plant.stability import all_equilibria, assess_stability
 from .plant.statics import solve_statics
-from .report.plots import plot_equilibria, plot_equilibrium
-from .report.tables import equilibria_table, equilibrium_record, equilibrium_table
 
 
 def solve_pose(options: argparse.Namespace) -> int:
@@ -46,10 +44,14 @@ def solve_pose(options: argparse.Namespace) -> int:
         eq = forward_statics(robot, q, force)
     else:
         raise ValueError("give --p, --q or both")
+    from .report.tables import equilibrium_record, equilibrium_table
+
     if options.equilibria:
         return _equilibria(options, eq)
     print(json.dumps(equilibrium_record(eq)) if options.json else equilibrium_table(eq))
     if options.picture:
+        from .report.plots import plot_equilibrium
+
         plot_equilibrium(eq, options.picture)
     return 0
 
@@ -65,6 +67,9 @@ def _question_angles(robot: Robot, q: list[float], advice: str) -> None:
 
 
 def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:
+    from .report.plots import plot_equilibria
+    from .report.tables import equilibria_table, equilibrium_record
+
     found = all_equilibria(eq.robot, None if options.p is None else eq.p, eq.q, options.force or (0.0, 0.0))
     if options.json:
         records = [

@@ -50,8 +50,6 @@ def choose_rung(options: argparse.Namespace) -> int:
 def time_loop(options: argparse.Namespace) -> int:
     """Run `pcr-mpc timing`."""
     scene = load_scene(options.scene)
-    if options.steps < 1:
-        raise ValueError(f"--steps is {options.steps}, expected at least 1")
     folder = options.out or Path("results") / "timing" / scene.name
     require_folder(folder, _TIMING, force=options.overwrite)
     result = time_scene(scene, options.steps, progress=True)
@@ -70,9 +68,6 @@ def time_loop(options: argparse.Namespace) -> int:
 def tune_controller(options: argparse.Namespace) -> int:
     """Run `pcr-mpc tune`."""
     scene, known = to_tune(options.scene, options.start)
-    for name in ("trials", "jobs", "episodes"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"--{name} is {getattr(options, name)}, expected at least 1")
     folder = Path("results") / "tune" / scene.name
     path = options.out or default_path(options.scene, scene.name)
     require_free(path, force=options.overwrite)

@@ -91,6 +91,37 @@ class StudyError(PCRError):
     """A study of many runs cannot go on, or ended without some of its results; names the file of those that it has."""
 
 
+def described(error: BaseException) -> str:
+    """What happened, for one line on a terminal; for the system's errors with the file, and what to do."""
+    if not isinstance(error, OSError) or error.filename is None:
+        return str(error) or type(error).__name__
+    advice = next((words for kind, words in _ADVICE.items() if isinstance(error, kind)), error.strerror or "failed")
+    return f"{error.filename}: {advice}"
+
+
+_ADVICE: dict[type[OSError], str] = {
+    FileNotFoundError: "no such file or folder",
+    IsADirectoryError: "is a folder, expected a file",
+    # A folder is made where there is none; only a file of its name is in the way.
+    FileExistsError: "is a file, where a folder is to be made; give another name",
+    NotADirectoryError: "is a path through a file, expected a folder",
+    PermissionError: "access is denied; change its rights, or take another place",
+}
+
+
+def checked_integer(name: str, value: Any, *, minimum: int = 1) -> int:
+    """Return ``value`` as an int of at least ``minimum``, NumPy's integers too, or say what it is instead.
+
+    Raises
+    ------
+    ValueError
+        Names the argument, its value and the bound.
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
+        raise ValueError(f"{name} = {value!r} must be a whole number of at least {minimum}")
+    return int(value)
+
+
 def checked_vector(name: str, value: Any, size: int) -> np.ndarray:
     """Return ``value`` as a finite float64 vector of ``size`` entries, or say what it is instead.
 

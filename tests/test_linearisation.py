@@ -85,8 +85,8 @@ def differences(plant, pose, x, u):
         plant.reset(x, pose)  # which is where the inertia is constant
         return plant.step(y, w)
 
-    a = [(step(x + h, u) - step(x - h, u)) / 2e-4 for h in 1e-4 * np.eye(6)]
-    b = [(step(x, u + h) - step(x, u - h)) / 2e-4 for h in 1e-4 * np.eye(2)]
+    a = [(step(x + h, u) - step(x - h, u)) / 2e-4 for h in 1e-4 * np.eye(len(x))]
+    b = [(step(x, u + h) - step(x, u - h)) / 2e-4 for h in 1e-4 * np.eye(len(u))]
     return np.array(a).T, np.array(b).T
 
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import control
 import numpy as np
+from scipy.linalg import solve_discrete_are
 from scipy.linalg.blas import dnrm2
 
 from ..errors import InfeasibleError, checked_array, checked_vector
@@ -262,8 +262,10 @@ def riccati(model: LinearModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]
     # (more than two motors), and changes the gains by less than 0.1 %.
     angle = max(tuning.angle_weight, 1e-6 * tuning.position_weight)
     stage = np.diag([tuning.position_weight] * 2 + [tuning.velocity_weight] * 2 + [angle] * (n_states - 4))
-    gain, cost, _ = control.dlqr(model.A, model.B, stage, tuning.input_weight * np.eye(n))
-    return np.asarray(gain), np.asarray(cost)
+    # SciPy itself, as python-control would call it: that one takes seconds to import.
+    a, b, r = np.array(model.A), np.array(model.B), tuning.input_weight * np.eye(n)
+    cost = solve_discrete_are(a, b, stage, r, s=np.zeros((n_states, n)))
+    return np.asarray(np.linalg.solve(b.T @ cost @ b + r, b.T @ cost @ a)), np.asarray(cost)
 
 
 def lqr_rates(gain: np.ndarray, x: np.ndarray, reference: Reference, dt: float) -> np.ndarray:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-import control
 import numpy as np
+from scipy.linalg import solve_discrete_are
 
 from ..errors import checked_number
 from ..linearisation.linear_model import LinearModel
@@ -31,7 +31,7 @@ class ObserverTuning:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            checked_number(field.name, getattr(self, field.name), above=0.0)
+            object.__setattr__(self, field.name, checked_number(field.name, getattr(self, field.name), above=0.0))
 
 
 class DisturbanceObserver:
@@ -97,6 +97,6 @@ def _gain(tuning: ObserverTuning, tip_noise: float, model: LinearModel) -> np.nd
     # In units of the tip's noise: the Riccati equation of 1e-10 m^2 is badly scaled.
     scale = tip_noise**2
     driven = noise @ (covariance / scale) @ noise.T
-    _, error, _ = control.dlqe(a, np.eye(6), output, (driven + driven.T) / 2, np.eye(2))
-    # control's gain predicts; this one corrects.
+    error = solve_discrete_are(a.T, output.T, (driven + driven.T) / 2, np.eye(2))
+    # Not the gain that predicts, but the one that corrects.
     return np.asarray(error @ output.T @ np.linalg.inv(output @ error @ output.T + np.eye(2)))

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import ModelError, checked_number
+from ..errors import ModelError, checked_integer, checked_number, checked_vector
 from ..files import name_problem
 from ..frozen import Frozen
+from ..methods import METHODS
 from ..toml_table import read_toml
 from .observer import ObserverTuning
 
-METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 SCHEMES = ("rk4", "rk8")
 LAWS = ("linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward")
 LINEARISE = ("here", "along_plan")
@@ -55,11 +55,15 @@ class Model:
     predict_delay: bool = True
 
     def __post_init__(self) -> None:
+        for name in ("segments", "steps"):
+            object.__setattr__(self, name, checked_integer(name, getattr(self, name)))
         for name, choices in (
-            ("method", METHODS), ("scheme", SCHEMES), ("inertia", INERTIAS), ("linearise", LINEARISE)
-        ):  # fmt: skip
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} is {getattr(self, name)!r}, expected one of {', '.join(choices)}")
+            ("method", METHODS),
+            ("scheme", SCHEMES),
+            ("inertia", INERTIAS),
+            ("linearise", LINEARISE),
+        ):
+            _check_choice(name, getattr(self, name), choices)
 
 
 @dataclass(frozen=True)
@@ -108,24 +112,25 @@ class Tuning:
 
     def __post_init__(self) -> None:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+            object.__setattr__(self, name, checked_integer(name, count))
         if problem := name_problem(self.name):
             raise ModelError(f"name: {problem}", key="name")
         if problem := _horizon_problem(self.horizon):
             raise ModelError(f"horizon {problem}", key="horizon")
-        if self.law not in LAWS:
-            raise ValueError(f"law is {self.law!r}, expected one of {', '.join(LAWS)}")
+        _check_choice("law", self.law, LAWS)
         for name in ("position_weight", "input_weight", "tolerance"):
-            checked_number(name, getattr(self, name), above=0.0)
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), above=0.0))
         for name in ("velocity_weight", "angle_weight"):
-            checked_number(name, getattr(self, name), minimum=0.0)
-        for gain in self.pd:
-            checked_number("pd", gain)
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), minimum=0.0))
+        _check_choice("fallback", self.fallback, FALLBACKS)
+        object.__setattr__(self, "pd", tuple(checked_vector("pd", self.pd, 2).tolist()))
         if self.period is not None:
-            checked_number("period", self.period, above=0.0)
-        if self.fallback not in FALLBACKS:
-            raise ValueError(f"fallback is {self.fallback!r}, expected one of {', '.join(FALLBACKS)}")
+            object.__setattr__(self, "period", checked_number("period", self.period, above=0.0))
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import control
 import numpy as np
 
 from ..frozen import Frozen
@@ -43,6 +42,8 @@ class LinearModel(Frozen):
 
     def to_control(self) -> Any:
         """Return the linear part as a `control.StateSpace` with the tip position as output."""
+        import control  # takes seconds, and nothing else needs it
+
         n_states, n_inputs = self.B.shape
         output = np.eye(2, n_states)
         return control.ss(self.A, self.B, output, np.zeros((2, n_inputs)), self.dt)

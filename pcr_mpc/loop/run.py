@@ -7,7 +7,7 @@ import json
 import math
 import zipfile
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from ..errors import ModelError, PCRError
 from ..files import require_folder, results
 from ..frozen import Frozen, read_only
 from ..linearisation.linear_limits import KINDS
+from ..plain import plain
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.robot import Robot
@@ -261,8 +262,8 @@ class Run(Frozen):
             "verdict": self.verdict(),
             "controller": self.controller,
             "plant": self.plant,
-            "rung": None if self.rung is None else asdict(self.rung),
-            "need": self._need(),
+            "rung": plain(self.rung),
+            "need": plain(self._need()),
             "seed": self.seed,
             "duration_s": float(self.t[-1]),
             "rms_mm": _rms(error_mm) if tracked else None,
@@ -322,7 +323,7 @@ class Run(Frozen):
         files = {name: str(folder / name) for name in RECORD}
         require_folder(folder, files, force=force)
         with results(folder) as staged:
-            np.savez_compressed(staged / "run.npz", **record(self), need=json.dumps(self._need()))
+            np.savez_compressed(staged / "run.npz", **record(self), need=json.dumps(plain(self._need())))
             write_csv(self, staged / "run.csv")
             text = json.dumps({**self.summary(), "files": files}, indent=2)
             (staged / "summary.json").write_text(text + "\n", encoding="utf-8")

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import check_numbers
+from ..methods import METHODS
 from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
 from ..plant.inertia import INERTIAS
 from ..plant.robot import Robot
 from ..plant.rod import SCHEMES
-from ..plant.statics import METHODS, default_method
+from ..plant.statics import default_method
 from ..plant.weight import WEIGHTS
 from ..toml_table import Table
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from .. import interrupt
 from ..control.tuning import Tuning
-from ..errors import SimulationError, checked_array, checked_vector
+from ..errors import SimulationError, checked_array, checked_integer, checked_vector
 from ..plant.robot import Robot
 from .controllers import Controller
 from .feasibility import reference_excess
@@ -68,6 +68,7 @@ def simulate(
         Before the start: names what plant or controller lack.
     """
     check_parts(plant, controller, carries=scene.payload is not None)
+    seed = checked_integer("seed", seed, minimum=0)
     per = round(scene.period / plant.dt)
     if per < 1 or abs(per * plant.dt - scene.period) > 1e-9 * scene.period:
         raise ValueError(f"plant.dt = {plant.dt} s does not divide the control period {scene.period} s")

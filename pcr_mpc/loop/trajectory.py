@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..errors import ModelError, check_numbers, checked_vector
+from ..errors import ModelError, check_numbers, checked_array, checked_vector
 from ..toml_table import Table
 
 _POSITIVE = {"above": 0.0}
@@ -18,6 +18,17 @@ class Trajectory(Protocol):
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """Position [m], velocity [m/s] and acceleration [m/s^2] at times t, shape (len(t), 3, 2)."""
+
+
+def sampled(trajectory: Trajectory, t: np.ndarray) -> np.ndarray:
+    """Position, velocity and acceleration at times t [s], shape (len(t), 3, 2), of a trajectory that may be anybody's.
+
+    Raises
+    ------
+    ValueError
+        It returned something else, or numbers that are not finite.
+    """
+    return checked_array(f"what the trajectory {type(trajectory).__name__} returned", trajectory(t), (len(t), 3, 2))
 
 
 def smooth_step(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

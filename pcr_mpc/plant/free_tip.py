@@ -164,8 +164,7 @@ def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -
             if values[0] <= 0 or solver.unstable_rods():
                 raise UnstableError(
                     f"the pose p = {p} m, q = {q} rad is in balance but not stable: smallest stiffness "
-                    f"{values[0]:.4g} N/m, unstable rods {solver.unstable_rods()}; "
-                    "the branch ended, choose other motor angles",
+                    f"{values[0]:.4g} N/m{_named(solver.unstable_rods())}; the branch ended, choose other motor angles",
                     eigenvalue=float(values[0]),
                     rod=solver.unstable_rods(),
                     p=p,
@@ -248,12 +247,16 @@ def _require_equilibrium(guess: Any) -> None:
         raise TypeError(f"guess is a {type(guess).__name__}, expected an Equilibrium")
 
 
+def _named(rods: tuple[int, ...]) -> str:
+    return f", unstable rods {', '.join(map(str, rods))}" if rods else ""
+
+
 def _require_usable(eq: Equilibrium) -> None:
     """Raise if a pose that the motors should hold is unstable or beyond their stops."""
     if not eq.stable:
         raise UnstableError(
             f"the branch leads to a pose at p = {eq.p} m, q = {eq.q} rad that is in balance but not stable: smallest "
-            f"stiffness {eq.stiffness_eigenvalues[0]:.4g} N/m, unstable rods {eq.unstable_rods}; choose a nearer tip "
+            f"stiffness {eq.stiffness_eigenvalues[0]:.4g} N/m{_named(eq.unstable_rods)}; choose a nearer tip "
             "or another working mode",
             eigenvalue=float(eq.stiffness_eigenvalues[0]),
             rod=eq.unstable_rods,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..buffered import BufferedFunction, graph_cache, per_thread
-from ..errors import PCRError, checked_array
+from ..errors import PCRError, checked_array, checked_integer
 from ..frozen import Frozen
 from .dynamics import Plant
 from .equilibrium import Equilibrium
@@ -82,8 +82,7 @@ def rollout(
     """
     if plant.step_model is None:
         raise ValueError(f"method {plant.method!r} with inertia {plant.inertia!r} has no rollout; use Plant.step")
-    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
-        raise ValueError(f"threads is {threads!r}, expected a whole number of at least 1")
+    threads = checked_integer("threads", threads)
     starts, inputs, f_ext, many = _checked(plant, x0, inputs, f_ext)
     robots, steps = inputs.shape[:2]
     x, residual = np.empty((robots, steps + 1, plant.n_states)), np.empty((robots, steps))

@@ -15,8 +15,8 @@ from ..loop.run import Run
 from ..loop.scene import Scene
 from ..loop.simulate import simulate
 from ..loop.tracking import TrackingController, make_controller
+from ..methods import METHODS
 from ..plant.dynamics import DERIVATIVE_ACCURACY, Plant
-from ..plant.statics import METHODS
 from .machine import machine, versions
 from .overhead import call_overhead
 from .stopwatch import WARM_UP, Times, distribution, measure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,11 +10,12 @@ from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, StudyError
 from ..files import replacing, require_free, stamped
 from ..loop.scene import Scene, load_scene
+from ..toml_table import read_toml
 
 
 def default_path(scene_file: Path, name: str) -> Path:
     """Where the tuning of a scene belongs: beside the one that its file names."""
-    own = tomllib.loads(scene_file.read_text(encoding="utf-8"))["control"]["tuning"]
+    own = read_toml(scene_file).table("control").text("tuning")
     return Path(os.path.normpath(scene_file.parent / own)).with_name(f"{name}.toml")
 
 
@@ -24,10 +24,27 @@ def to_tune(scene_file: Path, start: Path | None = None) -> tuple[Scene, Tuning 
 
     By default that is the scene's own tuning. One that bears the scene's name is from an earlier search: then it is
     default.toml beside it, as it was for that search, and what was found is there to be found again.
+
+    Raises
+    ------
+    ModelError
+        The scene has nothing to track, or there is no default.toml to start from.
     """
     scene, known = load_scene(scene_file), None
+    if scene.trajectory is None:
+        raise ModelError(
+            f"{scene_file}: scene {scene.name} has nothing to track, and so no controller to tune; give it a reference",
+            file=str(scene_file),
+            key="reference.kind",
+        )
     if scene.tuning is not None and scene.tuning.name == scene.name:
-        known, start = scene.tuning, start or default_path(scene_file, "default")
+        known = scene.tuning
+        if start is None and not (start := default_path(scene_file, "default")).is_file():
+            raise ModelError(
+                f"{start}: no such file; the tuning of scene {scene.name} is from an earlier search, which started "
+                "from there: name the tuning to start from with --start",
+                file=str(start),
+            )
     return (scene.tuned(load_tuning(start)) if start else scene), known
 
 
