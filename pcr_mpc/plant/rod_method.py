@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -56,8 +57,8 @@ class RodMethod:
         Residual at which a rod counts as solved: rounding.
     following : float
         Residual that will do from one time step of a simulation to the next.
-    branch : slice
-        The unknowns of order one that a warm start may not change much.
+    branch : casadi.Function
+        unknowns -> numbers of order one that a warm start may not change much.
     from_shape : callable
         (shape, clamp angle) -> unknowns: a cold start.
     from_nodes : callable
@@ -77,7 +78,7 @@ class RodMethod:
     chord: Any
     tolerance: float
     following: float
-    branch: slice
+    branch: Any
     from_shape: Callable[[HeldShape, float], np.ndarray]
     from_nodes: Callable[[np.ndarray, RodPhysics | None], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
@@ -111,7 +112,7 @@ def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
         # Relative to the load; on taut rods the equations have a condition of 1e8.
         tolerance=1e-10,
         following=1e-10,
-        branch=slice(0, None, 4),
+        branch=ca.Function("branch", [start], [start[0::4]]),
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
         to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
@@ -132,7 +133,7 @@ def closed_form_method() -> RodMethod:
         chord=elastica.rod_chord(),
         tolerance=1e-13,
         following=1e-11,
-        branch=slice(0, 3),
+        branch=elastica.branch(),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=lambda nodes, _: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
         to_nodes=elastica.nodes,
@@ -165,7 +166,6 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     unknowns, tangents, poses = (
         ca.reshape(block, -1, columns) for block, columns in zip(blocks, (n, 3 * n, n), strict=True)
     )
-    branch = list(range(width))[method.branch]
     columns: dict[str, list[Any]] = {name: [] for name in ("u", "t", "pose", "loads", "load_t", "scalars")}
     residuals, roughest, changes = [], [], []
     force, k, g = ca.MX(2, 1), ca.MX(2, 2), []
@@ -185,7 +185,7 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
             columns[name].append(value)
         residuals.append(residual)
         roughest.append(scalars[0])
-        changes.append(ca.norm_inf((u - predicted)[branch]))
+        changes.append(ca.norm_inf(method.branch(u) - method.branch(predicted)))
         unit = rod.bending_stiffness / rod.length**2
         force += unit * loads[:2]
         k += unit / rod.length * load_tangent[:2, :2]
@@ -198,6 +198,12 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
     result = ca.vertcat(force, ca.vec(k), ca.vec(ca.horzcat(*g)))
     function = ca.Function("warm_step", [target, start_record], [record, verdict, result])
     return inlined(function, method.newton)
+
+
+def enough_nodes(loads: np.ndarray, least: int) -> int:
+    """Nodes at most 4 / lambda apart, so that integrating between them is stable on taut rods; a power of two."""
+    load = math.sqrt(float(np.hypot(*loads[:2]).max()))
+    return max(least, 1 << max(0, math.ceil(math.log2(max(load, 1.0) / 4.0))))
 
 
 def inlined(function: Any, of_rod: Any) -> Any:
