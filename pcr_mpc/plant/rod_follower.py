@@ -70,10 +70,7 @@ class RodFollower:
     def __init__(self, method: RodMethod, physics: RodPhysics | None = None) -> None:
         self.method = method
         self._physics = physics
-        self._newton = BufferedFunction(method.newton)
-        self._check = BufferedFunction(method.residual)
-        self._retract = BufferedFunction(method.retract)
-        self._branch = BufferedFunction(method.branch)
+        self._newton, self._check, self._retract, self._distance = map(BufferedFunction, method.any_pull)
         if physics is not None:
             self._become(physics.values)
 
@@ -256,12 +253,9 @@ class RodFollower:
 
     def _apart(self, one: np.ndarray, other: np.ndarray) -> float:
         """How far two shapes of the rod are from each other, in numbers of order one."""
-        numbers = []
-        for unknowns in (one, other):
-            self._branch.inputs[0][:] = unknowns
-            self._branch()
-            numbers.append(self._branch.outputs[0].copy())
-        return float(np.abs(numbers[0] - numbers[1]).max())
+        self._distance.inputs[0][:], self._distance.inputs[1][:] = one, other
+        self._distance()
+        return float(self._distance.outputs[0][0])
 
     def _margin(self, state: RodState) -> float:
         """1 - lambda / lambda_c, known of plain rods only."""

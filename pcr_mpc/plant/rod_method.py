@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -40,6 +40,25 @@ class Shooting:
     scheme: str = "rk8"
 
 
+class RodGraphs(NamedTuple):
+    """Graphs by which a rod is solved.
+
+    Attributes
+    ----------
+    newton, residual : casadi.Function
+        See `multiple_shooting.rod_newton`.
+    retract : casadi.Function
+        (unknowns, change) -> unknowns: how a step is taken.
+    apart : casadi.Function
+        (unknowns, unknowns) -> how far two shapes are apart, in numbers of order one: a warm start may not change much.
+    """
+
+    newton: Any
+    residual: Any
+    retract: Any
+    apart: Any
+
+
 @dataclass(frozen=True, eq=False)
 class RodMethod:
     """One way to solve a rod: its graphs, and how its unknowns relate to shapes.
@@ -47,18 +66,16 @@ class RodMethod:
     Attributes
     ----------
     name : str
-    newton, residual : casadi.Function
-        See `multiple_shooting.rod_newton`.
-    retract : casadi.Function
-        (unknowns, change) -> unknowns: how a step is taken.
+    newton, residual, retract, apart : casadi.Function
+        `RodGraphs` of the warm step.
+    any_pull : RodGraphs
+        Of all other rungs: for rods however taut, where those of the warm step do not know them.
     chord : casadi.Function or None
         (unknowns, pose, tangent) -> change: a cheap iteration with derivatives that are there, if there is one.
     tolerance : float
         Residual at which a rod counts as solved: rounding.
     following : float
         Residual that will do from one time step of a simulation to the next.
-    branch : casadi.Function
-        unknowns -> numbers of order one that a warm start may not change much.
     from_shape : callable
         (shape, clamp angle) -> unknowns: a cold start.
     from_nodes : callable
@@ -75,10 +92,11 @@ class RodMethod:
     newton: Any
     residual: Any
     retract: Any
+    apart: Any
+    any_pull: RodGraphs
     chord: Any
     tolerance: float
     following: float
-    branch: Any
     from_shape: Callable[[HeldShape, float], np.ndarray]
     from_nodes: Callable[[np.ndarray, RodPhysics | None], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
@@ -103,16 +121,19 @@ def shooting_method(shooting: Shooting, robot: Robot) -> RodMethod:
         same = nodes.shape[1] == n
         return [(nodes if same else sample_rod(nodes, n + 1, of_rod)[2:, :n]).ravel(order="F")]
 
+    retract = ca.Function("retraction", [start, change], [start + change])
+    apart = ca.Function("apart", [start, change], [ca.norm_inf((start - change)[0::4])])
     return RodMethod(
         name="multiple_shooting",
         newton=newton,
         residual=residual,
-        retract=ca.Function("retraction", [start, change], [start + change]),
+        retract=retract,
+        apart=apart,
+        any_pull=RodGraphs(newton, residual, retract, apart),
         chord=None,
         # Relative to the load; on taut rods the equations have a condition of 1e8.
         tolerance=1e-10,
         following=1e-10,
-        branch=ca.Function("branch", [start], [start[0::4]]),
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
         to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
@@ -130,10 +151,13 @@ def closed_form_method() -> RodMethod:
         newton=newton,
         residual=residual,
         retract=elastica.retraction(),
+        apart=elastica.apart(),
+        any_pull=RodGraphs(
+            *elastica.rod_newton(any_pull=True), elastica.retraction(any_pull=True), elastica.apart(any_pull=True)
+        ),
         chord=elastica.rod_chord(),
         tolerance=1e-13,
         following=1e-11,
-        branch=elastica.branch(),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=lambda nodes, _: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
         to_nodes=elastica.nodes,
@@ -185,7 +209,7 @@ def warm_step(robot: Robot, method: RodMethod, iterations: int) -> Any:
             columns[name].append(value)
         residuals.append(residual)
         roughest.append(scalars[0])
-        changes.append(ca.norm_inf(method.branch(u) - method.branch(predicted)))
+        changes.append(method.apart(u, predicted))
         unit = rod.bending_stiffness / rod.length**2
         force += unit * loads[:2]
         k += unit / rod.length * load_tangent[:2, :2]
