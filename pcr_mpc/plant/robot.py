@@ -186,6 +186,11 @@ class Robot:
         return read_only(np.array([rod.bending_stiffness for rod in self.rods]))
 
     @cached_property
+    def force_scale(self) -> float:
+        """Sum of EI/L^2 [N], by which forces of rods are judged."""
+        return float((self.stiffnesses / self.lengths**2).sum())
+
+    @cached_property
     def angle_limits(self) -> np.ndarray:
         """Least and greatest motor angles, shape (n, 2) [rad]."""
         return read_only(np.array([rod.angle_limits for rod in self.rods]))
