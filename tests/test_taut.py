@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 from pcr_mpc import ConvergenceError, UnstableError, forward_statics, solve_statics
 from pcr_mpc.plant import elastica
+from pcr_mpc.plant.chart import critical_load
 
 from .test_elastica import by_mpmath
 
@@ -161,3 +162,18 @@ def test_advice_belongs_to_the_method(pair, centre):
     with pytest.raises(ConvergenceError, match="use more segments"):
         solve_statics(pair, taut, q, method="multiple_shooting", steps=1)
     assert "segments" not in str(closed.value)
+
+
+def test_limit_of_stability_of_any_taut_rod():
+    """A rod of any tip angle loses stability where a full loop is about to leave it, without a gap or a jump."""
+    angles = -np.linspace(13.1, 200.0, 60)
+    short_of_loop = [2 * (np.log(8.0) - at) - critical_load(at) for at in angles]
+    assert np.all(np.diff(short_of_loop) > -1e-9)
+    assert np.abs(np.diff(short_of_loop)).max() < 0.01
+    assert 0.5 < short_of_loop[0] < short_of_loop[-1] < 0.56
+
+
+def test_guess_without_a_load(pair, centre):
+    """Nodes of straight rods that carry nothing: a bad guess, and no arithmetic error."""
+    with pytest.raises(ConvergenceError):
+        solve_statics(pair, where_slacks_are(pair, (1e-4, 2e-4)), (3.1, 0.0), guess=np.zeros((2, 4, 8)))
