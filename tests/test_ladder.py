@@ -93,7 +93,7 @@ def test_the_penalty_is_exact(tuning, target, model, reference, pair):
     solution = hard.solve()
     assert np.abs(solution.y[4 * tuning.horizon :]).max() > 1e-3  # an angle limit is active
     for soft in (True, False):
-        softened = LimitedQP(tuning, 2, DT).solve(qp, x, [model], None, soft_angles=soft)
+        softened = LimitedQP(tuning, 2, DT, reach=model.reach).solve(qp, x, [model], None, soft_angles=soft)
         assert softened.inputs == pytest.approx(solution.x, abs=1e-5)
         assert softened.slack == {}
         assert softened.active == ("rate change", "angle")

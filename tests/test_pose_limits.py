@@ -113,11 +113,11 @@ def rows_for(x, model, p_high):
 def test_limited_qp_against_another_solver(problem):
     """The optimum of the limited problem, by SciPy's SLSQP on the plain problem."""
     tuning, x, model, qp = problem
-    free = LimitedQP(tuning, 2, DT).solve(qp, x, [model], None, soft_angles=False)
+    free = LimitedQP(tuning, 2, DT, reach=model.reach).solve(qp, x, [model], None, soft_angles=False)
     rollout = Rollout(6, 2)
     highest = rollout(x, [model], free.inputs)[1:, 1].max()
     limits = rows_for(x, model, highest - 5e-4)
-    answer = LimitedQP(tuning, 2, DT, limits.kinds).solve(qp, x, [model], limits, soft_angles=False)
+    answer = LimitedQP(tuning, 2, DT, limits.kinds, reach=model.reach).solve(qp, x, [model], limits, soft_angles=False)
     assert "tip region" in answer.active
     assert answer.slack == {}
     size = len(qp.q)
@@ -149,7 +149,7 @@ def test_limited_qp_against_another_solver(problem):
 def test_what_cannot_be_kept_gives_way_and_is_reported(problem):
     tuning, x, model, qp = problem
     limits = rows_for(x, model, x[1] - 0.02)  # it starts 20 mm outside
-    answer = LimitedQP(tuning, 2, DT, limits.kinds).solve(qp, x, [model], limits, soft_angles=False)
+    answer = LimitedQP(tuning, 2, DT, limits.kinds, reach=model.reach).solve(qp, x, [model], limits, soft_angles=False)
     states = Rollout(6, 2)(x, [model], answer.inputs)
     assert answer.slack["tip region"] == pytest.approx(states[1:, 1].max() - (x[1] - 0.02), rel=1e-3)
 

@@ -255,17 +255,30 @@ def terminal_weight(model: LinearModel, tuning: Tuning) -> np.ndarray:
     return riccati(model, tuning)[1]
 
 
+_UNSEEN = 7.7e-5  # weight on angles that the tip does not see, over that on the way that they move it
+
+
 def riccati(model: LinearModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
-    """Gain (n, 4 + n) and cost-to-go (4 + n, 4 + n) of the unconstrained LQR."""
+    """Gain (n, 4 + n) and cost-to-go (4 + n, 4 + n) of the unconstrained LQR.
+
+    The equation is solved in the model's own units, the way of the tip per radian and the period, in which similar
+    robots have the same numbers.
+    """
     n_states, n = model.B.shape
+    reach = model.reach
+    units = np.array([reach] * 2 + [reach / model.dt] * 2 + [1.0] * (n_states - 4))
     # A little weight on the angles keeps the Riccati equation solvable where the tip does not see them all
     # (more than two motors), and changes the gains by less than 0.1 %.
-    angle = max(tuning.angle_weight, 1e-6 * tuning.position_weight)
-    stage = np.diag([tuning.position_weight] * 2 + [tuning.velocity_weight] * 2 + [angle] * (n_states - 4))
+    position = tuning.position_weight * reach**2
+    angle = max(tuning.angle_weight, _UNSEEN * position)
+    velocity = tuning.velocity_weight * (reach / model.dt) ** 2
+    stage = np.diag([position] * 2 + [velocity] * 2 + [angle] * (n_states - 4)) / position
+    a, b = model.A * units / units[:, None], model.B / units[:, None] / model.dt
+    r = tuning.input_weight / (position * model.dt**2) * np.eye(n)
     # SciPy itself, as python-control would call it: that one takes seconds to import.
-    a, b, r = np.array(model.A), np.array(model.B), tuning.input_weight * np.eye(n)
     cost = solve_discrete_are(a, b, stage, r, s=np.zeros((n_states, n)))
-    return np.asarray(np.linalg.solve(b.T @ cost @ b + r, b.T @ cost @ a)), np.asarray(cost)
+    gain = np.linalg.solve(b.T @ cost @ b + r, b.T @ cost @ a)
+    return np.asarray(gain / units / model.dt), np.asarray(position * cost / np.outer(units, units))
 
 
 def lqr_rates(gain: np.ndarray, x: np.ndarray, reference: Reference, dt: float) -> np.ndarray:

@@ -94,9 +94,14 @@ def _gain(tuning: ObserverTuning, tip_noise: float, model: LinearModel) -> np.nd
     noise = np.block([[model.E[:4], np.zeros((4, 2))], [np.zeros((2, 2)), np.eye(2)]])
     covariance = np.diag([tuning.force_noise**2] * 2 + [tuning.force_walk**2] * 2)
     output = np.eye(2, 6)
-    # In units of the tip's noise: the Riccati equation of 1e-10 m^2 is badly scaled.
-    scale = tip_noise**2
-    driven = noise @ (covariance / scale) @ noise.T
+    # In units of the tip's noise, the period and the force that moves the tip by as much in it: the Riccati equation
+    # of 1e-10 m^2 is badly scaled, and similar robots then have the same numbers.
+    push = tip_noise / float(np.linalg.norm(model.E[:2], 2))
+    units = np.array([tip_noise] * 2 + [tip_noise / model.dt] * 2 + [push] * 2)
+    a = a * units / units[:, None]
+    noise = noise / units[:, None]
+    driven = noise @ covariance @ noise.T
     error = solve_discrete_are(a.T, output.T, (driven + driven.T) / 2, np.eye(2))
     # Not the gain that predicts, but the one that corrects.
-    return np.asarray(error @ output.T @ np.linalg.inv(output @ error @ output.T + np.eye(2)))
+    gain = error @ output.T @ np.linalg.inv(output @ error @ output.T + np.eye(2))
+    return np.asarray(units[:, None] / tip_noise * gain)

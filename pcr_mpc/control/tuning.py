@@ -80,7 +80,7 @@ class Tuning:
     input_weight : float
         On deviations of the motor rates from the feed-forward [1/(rad/s)^2].
     tolerance : float
-        OSQP's absolute and relative tolerance.
+        OSQP's absolute and relative tolerance; the absolute one is of rates [rad/s].
     max_iterations : int
         After which OSQP gives up.
     fallback : {"ladder", "raise"}

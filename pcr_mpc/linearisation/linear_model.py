@@ -40,6 +40,12 @@ class LinearModel(Frozen):
         """Predict the next state."""
         return np.asarray(self.A @ x + self.B @ u + self.c)
 
+    @property
+    def reach(self) -> float:
+        """How far the balanced tip moves at most when the motors turn [m/rad]: the length by which angles count."""
+        at_rest = np.linalg.lstsq(np.eye(4) - self.A[:4, :4], self.A[:4, 4:], rcond=None)[0]
+        return float(np.linalg.norm(at_rest[:2], 2))
+
     def to_control(self) -> Any:
         """Return the linear part as a `control.StateSpace` with the tip position as output."""
         import control  # takes seconds, and nothing else needs it

@@ -16,7 +16,7 @@ from ..plant.equilibrium import Equilibrium
 
 # A model is affine: about a point this far away [rod lengths], [rad] its force is off by the square of it.
 _MOVED = 5e-4
-_FORCE_CHANGED = 1e-5  # N
+_FORCE_CHANGED = 1.6e-5  # of sum EI/L^2: beyond it a model is moved to the new force
 
 
 @dataclass
@@ -44,6 +44,7 @@ class AlongPlan(Remade):
         length = float(plants[0].robot.lengths.mean()) if plants else 1.0
         n = plants[0].robot.n_rods if plants else 0
         self._moved = _MOVED * np.array([length] * 2 + [1.0] * n)
+        self._force_changed = _FORCE_CHANGED * plants[0].robot.force_scale if plants else 0.0
         self._at = np.full((len(plants), 2 + n), np.nan)  # where each model was made; NaN: there is none
 
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
@@ -74,7 +75,7 @@ class AlongPlan(Remade):
                 self._at[k] = np.nan
                 model = linearise(spot.plant, path[k], u, self._period, force)
                 self._at[k] = places[k]
-            elif max(map(abs, (force - model.force).tolist())) > _FORCE_CHANGED:
+            elif max(map(abs, (force - model.force).tolist())) > self._force_changed:
                 c = model.c + model.E @ (force - model.force)
                 model = LinearModel(model.A, model.B, c, model.E, model.dt, force.copy())
             spot.model = model

@@ -20,8 +20,8 @@ from .scene_checks import LATE, check_scene, is_multiple
 from .settings import Finding, Need, Payload, PlantSettings, read_finding, read_need, read_payload, read_plant
 from .trajectory import Trajectory, read_trajectory
 
-# Distance of the start from the reference that is taken for the same place [m].
-_START_TOLERANCE = 1e-3
+# Distance of the start from the reference that is taken for the same place, in rod lengths: found, and as given.
+_START_TOLERANCE, _START_ROUNDING = 2.5e-3, 2.5e-9
 _LOST = 0.1  # of the shortest rod
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
@@ -188,7 +188,7 @@ class Scene:
             eq = forward_statics(self.robot, self.start_motors)
             if self.trajectory is not None:
                 begin = self.trajectory(np.zeros(1))[0, 0]
-                if np.hypot(*(begin - eq.p)) > _START_TOLERANCE:
+                if np.hypot(*(begin - eq.p)) > _START_TOLERANCE * self.robot.lengths.mean():
                     raise ModelError(
                         f"{self.name}: at start.motors the free tip rests at {eq.p} m (mode {eq.mode}), but "
                         f"the reference begins at {begin} m; start from that tip and a mode instead",
@@ -264,7 +264,7 @@ def load_scene(path: str | Path) -> Scene:
         )
     if tip is not None and trajectory is not None:
         begin = trajectory(np.zeros(1))[0, 0]
-        if np.hypot(*(begin - tip)) > 1e-9:
+        if np.hypot(*(begin - tip)) > _START_ROUNDING * robot.lengths.mean():
             raise ModelError(
                 f"{path}: start.tip {tip} is not where the reference begins, {tuple(begin.tolist())}",
                 file=str(path),

@@ -159,7 +159,7 @@ def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -
         stiffness, _ = solver.jacobians()
         values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
         # No better than the tip position is resolved, which counts where rods are nearly straight.
-        tolerance = _FORCE_TOLERANCE * _force_scale(robot) + _RESOLUTION * float(robot.lengths.max() * values[-1])
+        tolerance = _FORCE_TOLERANCE * robot.force_scale + _RESOLUTION * float(robot.lengths.max() * values[-1])
         if math.hypot(*residual) <= tolerance:
             if values[0] <= 0 or solver.unstable_rods():
                 raise UnstableError(
@@ -302,7 +302,7 @@ def _reach(solver: RodSolver, guess: Equilibrium, p: np.ndarray, force: np.ndarr
 
 def _turn(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Turn the motors by Newton's method (least motion if redundant) until the rods carry ``force`` at p."""
-    tolerance = _FORCE_TOLERANCE * _force_scale(solver.robot)
+    tolerance = _FORCE_TOLERANCE * solver.robot.force_scale
     solver.move(p, q)
     residual, trials = force - solver.force(), 0
     while math.hypot(*residual) > tolerance:
@@ -346,7 +346,7 @@ def _tip_starts(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
 
 def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | None) -> list[np.ndarray]:
     """Motor angles within limits whose coarse shapes nearly carry ``force``, best first."""
-    scale = _force_scale(robot)
+    scale = robot.force_scale
     # The coarser, the more rods there are to combine.
     stride = math.ceil(len(_OFFSETS) / max(1, int(_COMBINATIONS ** (1 / robot.n_rods))))
     offsets = _OFFSETS[stride // 2 :: stride]
@@ -389,10 +389,6 @@ def _nearest_turn(angles: np.ndarray, wanted: Any, lower: Any, upper: Any) -> np
     least, most = np.ceil((lower - angles) / turn), np.floor((upper - angles) / turn)
     turns = np.minimum(np.maximum(np.round((wanted - angles) / turn), least), most)
     return np.asarray(np.where(least <= most, angles + turn * turns, angles))
-
-
-def _force_scale(robot: Robot) -> float:
-    return float((robot.stiffnesses / robot.lengths**2).sum())
 
 
 def free_solver(robot: Robot) -> RodSolver:
