@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: track test test-slow lint figures charts benchmarks clean
+.PHONY: track test test-slow lint figures charts benchmarks mutants clean
 
 track: $(READY)  ## follow the figure of eight in closed loop; pictures and table in results/lemniscate
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml
@@ -51,6 +51,10 @@ charts: $(READY)  ## speed against accuracy: three charts, their CSVs and the ra
 
 benchmarks: $(READY)  ## ratios of ours to fixed references against those kept in docs/benchmarks.json
 	$(BIN)/python -m experiments.benchmarks
+
+N ?= 200
+mutants: $(READY)  ## which of N changes of the code the tests notice, in results/mutants; hours
+	$(BIN)/python -m experiments.mutants --count $(N)
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -354,7 +354,8 @@ def track(scene: Scene, controller: Controller) -> Row:
     rate = np.abs(run.u).max(axis=1)
     return {
         **row, "rms_mm": np.sqrt(np.mean(late**2)), "max_mm": late.max(), "max_rate_rad_s": rate.max(),
-        "at_rate_limit": np.mean(rate > scene.robot.rate_limit - 1e-3), "fallbacks": len(run.events), "failure": "",
+        "at_rate_limit": np.mean(rate > scene.robot.rate_limit - 1e-3), "fallbacks": run.summary()["fallbacks"],
+        "failure": "",
     }  # fmt: skip
 
 

@@ -8,19 +8,22 @@ import math
 import sys
 from pathlib import Path
 
+from .files import require_free, stamped, write_text
 from .plant.equilibrium import Equilibrium
 from .plant.free_tip import forward_statics, inverse_statics
 from .plant.mjcf import mjcf
-from .plant.robot import load_robot
+from .plant.robot import Robot, load_robot
 from .plant.stability import all_equilibria, assess_stability
 from .plant.statics import solve_statics
-from .report.plots import plot_equilibria, plot_equilibrium
-from .report.tables import equilibria_table, equilibrium_record, equilibrium_table
 
 
 def solve_pose(options: argparse.Namespace) -> int:
     """Run `pcr-mpc statics`."""
     robot = load_robot(options.robot)
+    if options.equilibria and options.picture is None:
+        options.picture = Path("results") / "equilibria.png"
+    if options.picture:
+        require_free(options.picture, force=options.overwrite)
     q = options.q
     if options.method and (options.p is None or q is None):
         raise ValueError("--method goes with both --p and --q")
@@ -31,6 +34,8 @@ def solve_pose(options: argparse.Namespace) -> int:
     force = options.force or (0.0, 0.0)
     if q is not None and options.degrees:
         q = [math.radians(angle) for angle in q]
+    if q is not None:
+        _question_angles(robot, q, "" if options.degrees else ", or add --degrees if these are degrees")
     if options.p is not None and q is not None:
         eq = solve_statics(robot, options.p, q, method=options.method or "closed_form")
     elif options.p is not None:
@@ -39,15 +44,32 @@ def solve_pose(options: argparse.Namespace) -> int:
         eq = forward_statics(robot, q, force)
     else:
         raise ValueError("give --p, --q or both")
+    from .report.tables import equilibrium_record, equilibrium_table
+
     if options.equilibria:
         return _equilibria(options, eq)
     print(json.dumps(equilibrium_record(eq)) if options.json else equilibrium_table(eq))
     if options.picture:
+        from .report.plots import plot_equilibrium
+
         plot_equilibrium(eq, options.picture)
     return 0
 
 
+def _question_angles(robot: Robot, q: list[float], advice: str) -> None:
+    """Refuse angles that are more than a turn beyond the motors' stops."""
+    for i, (angle, (lower, upper)) in enumerate(zip(q, robot.angle_limits, strict=False)):
+        if not lower - 2 * math.pi <= angle <= upper + 2 * math.pi:
+            raise ValueError(
+                f"--q {angle:g} rad is more than a turn beyond the stops of motor {i}, [{lower:g}, {upper:g}] rad; "
+                f"take off the whole turns{advice}"
+            )
+
+
 def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:
+    from .report.plots import plot_equilibria
+    from .report.tables import equilibria_table, equilibrium_record
+
     found = all_equilibria(eq.robot, None if options.p is None else eq.p, eq.q, options.force or (0.0, 0.0))
     if options.json:
         records = [
@@ -57,19 +79,17 @@ def _equilibria(options: argparse.Namespace, eq: Equilibrium) -> int:
         print(json.dumps(records))
     else:
         print(equilibria_table(found))
-    picture = options.picture or Path("results") / "equilibria.png"
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    plot_equilibria(found, picture)
-    print(f"drawn in {picture}", file=sys.stderr)
+    plot_equilibria(found, options.picture)
+    print(f"drawn in {options.picture}", file=sys.stderr)
     return 0
 
 
 def export(options: argparse.Namespace) -> int:
     """Run `pcr-mpc export`."""
     robot = load_robot(options.robot)
+    require_free(options.out, force=options.overwrite)
     eq = inverse_statics(robot, options.p, mode=options.mode)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(mjcf(robot, pose=eq, links=options.links), encoding="utf-8")
+    write_text(options.out, stamped(mjcf(robot, pose=eq, links=options.links), ("<!-- ", " -->")))
     record = {"file": str(options.out), "links": options.links, "mode": eq.mode, "q": eq.q.tolist()}
     print(json.dumps(record) if options.json else f"{options.links} links a rod, mode {eq.mode}: {options.out}")
     return 0

@@ -71,6 +71,10 @@ class ReadOnlyError(PCRError, AttributeError):
     """An attribute that cannot be set was: its name is ``attribute``; the message says what to do instead."""
 
 
+class MeasurementError(PCRError, ValueError):
+    """A controller's first measurement contradicts the pose in which it was started, as other units do."""
+
+
 class CompilerError(PCRError):
     """No machine code could be made of a graph; ``command`` is what was run."""
 
@@ -79,8 +83,43 @@ class NoRungError(PCRError):
     """No rung of the ladder of physics meets a scene's ``need``: ``best_error`` [m], and why each was ``rejected``."""
 
 
+class OutputError(PCRError):
+    """A file cannot be written, or is somebody's work and is left alone: ``path``."""
+
+
 class StudyError(PCRError):
     """A study of many runs cannot go on, or ended without some of its results; names the file of those that it has."""
+
+
+def described(error: BaseException) -> str:
+    """What happened, for one line on a terminal; for the system's errors with the file, and what to do."""
+    if not isinstance(error, OSError) or error.filename is None:
+        return str(error) or type(error).__name__
+    advice = next((words for kind, words in _ADVICE.items() if isinstance(error, kind)), error.strerror or "failed")
+    return f"{error.filename}: {advice}"
+
+
+_ADVICE: dict[type[OSError], str] = {
+    FileNotFoundError: "no such file or folder",
+    IsADirectoryError: "is a folder, expected a file",
+    # A folder is made where there is none; only a file of its name is in the way.
+    FileExistsError: "is a file, where a folder is to be made; give another name",
+    NotADirectoryError: "is a path through a file, expected a folder",
+    PermissionError: "access is denied; change its rights, or take another place",
+}
+
+
+def checked_integer(name: str, value: Any, *, minimum: int = 1) -> int:
+    """Return ``value`` as an int of at least ``minimum``, NumPy's integers too, or say what it is instead.
+
+    Raises
+    ------
+    ValueError
+        Names the argument, its value and the bound.
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
+        raise ValueError(f"{name} = {value!r} must be a whole number of at least {minimum}")
+    return int(value)
 
 
 def checked_vector(name: str, value: Any, size: int) -> np.ndarray:
@@ -98,6 +137,34 @@ def checked_vector(name: str, value: Any, size: int) -> np.ndarray:
     if not all(map(math.isfinite, array.tolist())):
         raise ValueError(f"{name} is not finite: {array}")
     return array
+
+
+def measured_vector(name: str, value: Any, size: int) -> np.ndarray:
+    """Return ``value`` as a float64 vector of ``size`` entries, finite or not; a row or a column means the same.
+
+    Raises
+    ------
+    ValueError
+        Names the argument and both shapes, or the entries that are not numbers.
+    """
+    if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == (size,):
+        return value
+    if np.shape(value) in ((size, 1), (1, size)):
+        value = np.reshape(value, size)
+    return _float_array(name, value, (size,))
+
+
+def checked_period(name: str, value: Any) -> int:
+    """Return ``value`` as the number of a control period, or say what it is instead.
+
+    Raises
+    ------
+    ValueError
+        Names the argument and its value.
+    """
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral) or value < 0:
+        raise ValueError(f"{name} = {value!r} must be a whole number, counted from 0")
+    return int(value)
 
 
 def checked_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -141,6 +208,21 @@ def checked_number(
     if problem:
         raise ValueError(f"{name}: {problem}")
     return float(value)
+
+
+def check_numbers(instance: Any, bounds: dict[str, dict[str, float]]) -> None:
+    """Replace numbers of a frozen dataclass by floats within bounds (see `checked_number`), in its ``__post_init__``.
+
+    Raises
+    ------
+    ModelError
+        Names the attribute, its value and the bounds.
+    """
+    for name, bound in bounds.items():
+        try:
+            object.__setattr__(instance, name, checked_number(name, getattr(instance, name), **bound))
+        except ValueError as error:
+            raise ModelError(str(error), key=name) from None
 
 
 def number_problem(

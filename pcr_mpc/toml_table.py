@@ -9,9 +9,37 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from .errors import ModelError, number_problem
+from .errors import ModelError, described, number_problem
 
 _REQUIRED: Any = object()
+# Likeness of two words from which one may be meant for the other.
+_NEAR = 0.75
+_WORD = 4  # letters of what may be meant as a part of a longer name
+# What people look for in a robot or scene and the toolkit does not describe, by how its name begins.
+_UNDESCRIBED = {
+    ("motor", "actuator", "gear", "servo"): "motors are described by [motors] rate_limit, acceleration_limit and "
+    "torque_limit of the robot and angle_limits of each rod, one to a rod and no dynamics besides",
+    ("platform", "end_effector", "effector", "plate"): "there is no platform with an orientation: the rods meet in one "
+    "passive joint, whose mass is [tip] mass",
+    ("tendon", "cable", "wire", "string"): "tendons are not described: rods are driven by turning their bases",
+    (
+        "joint",
+        "hinge",
+        "clamp",
+    ): "joints are not described: each rod is clamped to a motor and all end in one passive joint",
+    (
+        "friction",
+        "damping",
+        "viscosity",
+        "backlash",
+        "hysteresis",
+    ): "no friction or damping but [tip] drag is described",
+    ("contact", "obstacle", "collision", "ground", "wall"): "contact with anything is not described",
+    ("torsion", "twist", "shear", "poisson", "z"): "the robot is planar: there is no torsion, shear or third axis",
+    ("plastic", "fatigue", "temperature"): "the rods are elastic and nothing else is described",
+    ("young", "elastic", "diameter", "radius", "thickness", "width"): "rods are described by "
+    "bending_stiffness [N m^2] and line_density [kg/m], which follow from material and cross-section",
+}
 
 
 class Table:
@@ -41,10 +69,12 @@ class Table:
         return ModelError(f"{self.path}: {self.name}{key}: {problem}", file=str(self.path), key=key, **details)
 
     def _unknown(self, key: str) -> None:
-        nearest = difflib.get_close_matches(key, self._known, n=1, cutoff=0.0)
-        hint = f"did you mean {nearest[0]!r}?" if nearest else "no key is known here"
-        raise self.fail(key, f"unknown key; {hint} (known: {', '.join(self._known)})",
-                        nearest=nearest[0] if nearest else None)  # fmt: skip
+        parts = [known for known in self._known if len(key) >= _WORD and key in known]
+        nearest = next(iter([*difflib.get_close_matches(key, self._known, n=1, cutoff=_NEAR), *parts]), None)
+        undescribed = next((words for stems, words in _UNDESCRIBED.items() if key.lower().startswith(stems)), None)
+        hint = f"; did you mean {nearest!r}?" if nearest else f"; {undescribed}" if undescribed else ""
+        known = f"known here: {', '.join(dict.fromkeys(self._known))}" if self._known else "no key is known here"
+        raise self.fail(key, f"unknown key{hint} ({known})", nearest=nearest)
 
     def _take(self, key: str, default: Any) -> Any:
         self._known.append(key)
@@ -53,7 +83,7 @@ class Table:
         if default is _REQUIRED:
             # A misspelt required key is both missing and unknown: name the misspelling.
             for other in self._data:
-                if difflib.get_close_matches(other, [key], n=1, cutoff=0.75):
+                if difflib.get_close_matches(other, [key], n=1, cutoff=_NEAR):
                     raise self.fail(other, f"unknown key; did you mean {key!r}?", nearest=key)
             raise self.fail(key, "missing")
         return default
@@ -150,10 +180,14 @@ def read_toml(path: str | Path) -> Table:
     """
     path = Path(os.path.normpath(path))
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise ModelError(f"{path}: no such file", file=str(path)) from None
-    # ValueError: not UTF-8, not TOML, or an integer of thousands of digits; RecursionError: thousands of brackets.
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise ModelError(described(error) if error.filename else f"{path}: {error}", file=str(path)) from error
+    # ValueError: not TOML, or an integer of thousands of digits; RecursionError: thousands of brackets.
+    except UnicodeDecodeError as error:
+        raise ModelError(f"{path}: is not UTF-8 text ({error}); save it as UTF-8", file=str(path)) from error
+    except (ValueError, RecursionError) as error:
         raise ModelError(f"{path}: {error}", file=str(path)) from error
     return Table(path, "", data)

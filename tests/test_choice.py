@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import ConvergenceError, load_scene
+from pcr_mpc import ConvergenceError, forward_statics, inverse_statics, load_scene
 from pcr_mpc.errors import NoRungError
 from pcr_mpc.loop.settings import Need, PlantSettings
 from pcr_mpc.report.choice_tables import choice_record, choice_table
@@ -168,11 +168,12 @@ def test_release_needs_the_condensed_mass(release, choice):
     assert choice.yardstick.inertia == "full"
     assert not choice.lacking
     assert choice.tip_error <= release.need.tip_accuracy
-    assert choice.step_error < 1e-7
+    # Gauss's at 0.25 ms; its fourth order leaves nanometres, not nothing.
+    assert 2e-10 < choice.step_error < 2e-8
 
 
 def test_estimates_are_of_the_right_size():
-    """Within a factor of ten, most within three, of what the neighbouring rungs differ by over the whole motion."""
+    """By a factor of 1.5 too small to 3 too large, against what the neighbouring rungs differ by over the motion."""
     expected = {  # mm; docs/rungs.csv
         "release": {"rods' inertia": 2.6},
         "payload": {"payload": 59.0, "rods' inertia": 0.68, "change of inertia": 0.11, "rods' vibration": 0.012},
@@ -189,7 +190,8 @@ def test_estimates_are_of_the_right_size():
             for level in steps:
                 found |= estimates.of_level(ladder, level)
         for effect, error in effects.items():
-            assert error / 4 < 1e3 * found[effect].error < 8 * error, (name, effect, found[effect])
+            largest = 6 if (name, effect) == ("heavy_rods", "rods' vibration") else 3
+            assert error / 1.5 < 1e3 * found[effect].error < largest * error, (name, effect, found[effect])
         highest = all_physics(scene, 1e-3)[-1]
         assert estimates.of(highest) == {}
 
@@ -200,7 +202,11 @@ def test_estimate_of_varying_stiffness():
     scene = replace(scene, robot=replace(scene.robot, rods=rods))
     found = Estimates(scene, scene.start()).of_level("rods", "plain")
     assert list(found) == ["stiffness along the rods"]
-    assert 1e-4 < found["stiffness along the rods"].error < 0.1
+    # Where the tip rests at the same motor angles on plain rods.
+    pose, plain = scene.start(), scene.robot.plain()
+    there = forward_statics(plain, pose.q, guess=inverse_statics(plain, pose.p, mode=pose.mode))
+    off = np.linalg.norm(there.p - pose.p)
+    assert off / 1.5 < found["stiffness along the rods"].error < 6 * off
 
 
 def test_estimated_steps(release, choice):
@@ -213,7 +219,9 @@ def test_estimated_steps(release, choice):
     assert estimates.step("rk4", 2e-3).error == pytest.approx(16 * estimates.step("rk4", 1e-3).error)
     for one in choice.discretisations:
         own = estimates.step(one.rung.integrator, one.rung.dt).error
-        assert own / 10 < one.error < 10 * own + 1e-6, named(release, one.rung)
+        # Euler's estimate is that of the velocity, half a step late, all the way; Verlet's is its phase.
+        least, largest = (10, 1) if one.rung.integrator == "semi_implicit_euler" else (1.5, 1.5)
+        assert own / least < one.error < largest * own, named(release, one.rung)
 
 
 def test_a_rung_that_the_plant_refuses_is_listed_and_the_yardstick_says_what_it_lacks(release, monkeypatch):

@@ -57,7 +57,7 @@ def file(original):
 
 
 def test_the_chosen_rung_is_written_and_known_again(file, choice, capsys, monkeypatch):
-    monkeypatch.setattr("pcr_mpc.cli.choose", lambda scene, *, progress: choice)
+    monkeypatch.setattr("pcr_mpc.cli_study.choose", lambda scene, *, progress: choice)
     assert not verified(load_scene(file))
     assert main(["choose", str(file), "--write"]) == 0
     assert "chosen: inertia condensed" in capsys.readouterr().out

@@ -1,4 +1,5 @@
 import json
+import math
 import re
 import shutil
 
@@ -7,6 +8,7 @@ import pytest
 from matplotlib import image
 
 from pcr_mpc.cli import main
+from pcr_mpc.report.timing import timing_tables
 
 from .conftest import CONTROLLERS, MODELS
 
@@ -66,7 +68,8 @@ def test_statics_three_ways(capsys, tmp_path):
     assert "0.927501" in capsys.readouterr().out
 
 
-def test_timing(scene, tmp_path, capsys):
+def test_timing(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("pcr_mpc.study.stopwatch._INTERRUPTED", math.inf)  # however busy the machine is
     assert main(["timing", str(scene), "--steps", "100", "--json", "--out", str(tmp_path / "t")]) == 0
     result = json.loads(capsys.readouterr().out)
     names = {(c["name"], c["method"]) for c in result["components"]}
@@ -83,9 +86,17 @@ def test_timing(scene, tmp_path, capsys):
     assert step["n"] == 80
     assert len(step["first"]) == 20
     assert sum(sum(counts) for counts in result["histogram"]["control step"].values()) == 80
-    assert sum(row["n"] for row in result["iterations"]) == 80 - step["interrupted"]
-    if not step["interrupted"]:
-        assert sum(result["control_parts"].values()) == pytest.approx(step["mean"])
+    assert step["interrupted"] == 0
+    assert sum(row["n"] for row in result["iterations"]) == 80
+    assert sum(result["control_parts"].values()) == pytest.approx(step["mean"])
+    text = timing_tables(result)
+    for component in result["components"]:
+        (line, *_) = (
+            line for line in text.splitlines() if line.startswith(f"{component['name']} ({component['method']})")
+        )
+        assert line.split()[-1] == str(component["n"])
+        assert (f"{component['p50']:.1f}" if component["p50"] < 100 else f"{component['p50']:.0f}") in line.split()
+    assert "deadlines missed" in text
     assert {row["name"] for row in result["overhead"]} == {"graph", "plain call", "Plant.step", "rollout"}
     assert result["versions"]["casadi"]
     assert result["machine"]["cores"] >= 1

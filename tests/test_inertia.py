@@ -193,8 +193,12 @@ def test_constant_is_the_mass_at_the_reset(pair, centre):
     plant = started(pair, centre, state(centre), inertia="constant")
     mass, slopes = plant.mass(centre.p, centre.q)
     assert mass == pytest.approx(started(pair, centre, state(centre)).mass(centre.p, centre.q)[0], abs=0)
+    x = state(centre)
     for _ in range(50):
-        x = plant.step(state(centre), (1.0, 1.0))
+        x = plant.step(x, (1.0, 1.0))
+    assert np.abs(x[4:] - centre.q) == pytest.approx(0.05, abs=1e-12)
+    moved = started(pair, centre, x).mass(x[:2], x[4:])[0]
+    assert np.abs(moved - mass).max() > 1e-3 * np.abs(mass[:2, 2:]).max()  # it would have changed
     assert (plant.mass(x[:2], x[4:])[0] == mass).all()
     assert not slopes.any()
 

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from pcr_mpc import InfeasibleError, LinearMPC, Plant, Reference, linearise, load_tuning
 from pcr_mpc.control.tuning import Limits
@@ -97,9 +98,24 @@ def test_a_tight_angle_limit_is_solved_not_fallen_back_from(tuning, target, mode
 
 @pytest.mark.parametrize("horizon", [1, 2, 60])
 def test_any_horizon(tuning, target, model, pair, horizon):
+    """Where no limit is met, the cost-to-go at its end makes the plan of every horizon that of the LQR."""
+    tuning = replace(tuning, horizon=horizon, tolerance=1e-9, angle_weight=1.0)
     reference = Reference(np.tile(target, (horizon, 1)), np.zeros((horizon, 2)))
-    mpc = LinearMPC(replace(tuning, horizon=horizon), Limits(6.0, 3.0, *pair.angle_limits.T))
-    assert mpc.solve(far(target), model, reference, np.zeros(2)).inputs.shape == (horizon, 2)
+    mpc = LinearMPC(tuning, Limits(6.0, 6.0, *pair.angle_limits.T))
+    x = target + 1e-2 * (far(target) - target)
+    weights = np.diag([tuning.position_weight] * 2 + [tuning.velocity_weight] * 2 + [1.0] * 2)
+    a, b = np.array(model.A), np.array(model.B)
+    cost = solve_discrete_are(a, b, weights, tuning.input_weight * np.eye(2))
+    gain = np.linalg.solve(b.T @ cost @ b + tuning.input_weight * np.eye(2), b.T @ cost @ a)
+    wanted, off = [], x - target
+    for _ in range(horizon):
+        wanted.append(-gain @ off)
+        off = a @ off + b @ wanted[-1]
+    plan = mpc.solve(x, model, reference, np.zeros(2))
+    assert plan.status == "solved"
+    assert plan.active == ()
+    assert plan.inputs == pytest.approx(np.array(wanted), abs=1e-4 * np.abs(wanted).max())
+    assert np.abs(wanted).max() > 1e-3
 
 
 def test_another_period_is_refused(tuning, target, model, reference, pair):

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
-from pcr_mpc import ConvergenceError, PCRError, Plant, UnreachableError, load_robot
+from pcr_mpc import ConvergenceError, PCRError, Plant, UnreachableError, inverse_statics, load_robot
 from pcr_mpc.plant.dynamics import INTEGRATORS
 
 from .conftest import MODELS
@@ -179,13 +180,22 @@ def test_bad_arguments_are_named(pair, centre):
 
 
 def test_three_rods_move():
+    """Against the linear equation m dp'' + c dp' = -K dp - G dq, whose K and G other tests hold to differences of F."""
     robot = load_robot(MODELS / "three_rods.toml")
-    from pcr_mpc import inverse_statics
-
     pose = inverse_statics(robot, (0.0, 0.115), mode="LLL")
-    plant = Plant(robot, integrator="velocity_verlet", dt=1e-3)
-    x = np.concatenate([pose.p, [0.05, 0.0], pose.q])
+    plant = Plant(robot, integrator="rk4", dt=1e-3)
+    u, seconds = np.array([0.01, 0.0, -0.02]), 0.05
+    x = np.concatenate([pose.p, [5e-3, -2e-3], pose.q])
     plant.reset(x, pose)
-    for _ in range(50):
-        x = plant.step(x, (0.1, 0.0, -0.1))
-    assert np.linalg.norm(x[:2] - pose.p) < 0.02
+    rates = np.zeros((7, 7))
+    rates[:2, 2:4] = np.eye(2)
+    rates[2:4] = np.hstack([-pose.dforce_dp, -robot.drag * np.eye(2), -pose.dforce_dq]) / robot.tip_mass
+    # Motors turn at u: q = q0 + u t, as a state of its own.
+    whole = np.block([[rates, np.vstack([np.zeros((4, 3)), np.eye(3)])], [np.zeros((3, 10))]])
+    moved = (expm(seconds * whole) @ np.concatenate([[0.0, 0.0], x[2:4], np.zeros(3), u]))[:7]
+    for _ in range(round(seconds / plant.dt)):
+        x = plant.step(x, u)
+    assert x[4:] == pytest.approx(pose.q + seconds * u, abs=1e-12)
+    assert np.abs(moved[:2]).max() > 5e-5
+    assert x[:2] - pose.p == pytest.approx(moved[:2], abs=0.02 * np.abs(moved[:2]).max())
+    assert x[2:4] == pytest.approx(moved[2:4], abs=0.02 * np.abs(moved[2:4]).max())

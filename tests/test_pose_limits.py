@@ -115,11 +115,13 @@ def rows_for(x, model, p_high):
 def test_limited_qp_against_another_solver(problem):
     """The optimum of the limited problem, by SciPy's SLSQP on the plain problem."""
     tuning, x, model, qp = problem
-    free = LimitedQP(tuning, 2, DT).solve(qp, x, LinearModels.of([model]), None, soft_angles=False)
+    free = LimitedQP(tuning, 2, DT, reach=model.reach).solve(qp, x, LinearModels.of([model]), None, soft_angles=False)
     check = Check(6, 2)
     highest = check.states(x, LinearModels.of([model]), free.inputs)[1:, 1].max()
     limits = rows_for(x, model, highest - 5e-4)
-    answer = LimitedQP(tuning, 2, DT, limits.kinds).solve(qp, x, LinearModels.of([model]), limits, soft_angles=False)
+    answer = LimitedQP(tuning, 2, DT, limits.kinds, reach=model.reach).solve(
+        qp, x, LinearModels.of([model]), limits, soft_angles=False
+    )
     assert "tip region" in answer.active
     assert answer.slack == {}
     size = len(qp.q)
@@ -151,7 +153,9 @@ def test_limited_qp_against_another_solver(problem):
 def test_what_cannot_be_kept_gives_way_and_is_reported(problem):
     tuning, x, model, qp = problem
     limits = rows_for(x, model, x[1] - 0.02)  # it starts 20 mm outside
-    answer = LimitedQP(tuning, 2, DT, limits.kinds).solve(qp, x, LinearModels.of([model]), limits, soft_angles=False)
+    answer = LimitedQP(tuning, 2, DT, limits.kinds, reach=model.reach).solve(
+        qp, x, LinearModels.of([model]), limits, soft_angles=False
+    )
     states = Check(6, 2).states(x, LinearModels.of([model]), answer.inputs)
     assert answer.slack["tip region"] == pytest.approx(states[1:, 1].max() - (x[1] - 0.02), rel=1e-3)
 
@@ -195,11 +199,12 @@ def test_the_controller_does_not_drive_through_a_fold(pair):
         force=(5.0, 5.0),
         tuning=load_tuning(CONTROLLERS / "frozen.toml"),
         pose_limits=PoseLimits(),
+        tracking_error=0.3,  # where the branch ends is far from where it should go
     )
     with pytest.raises(SimulationError, match="its branch ends"):
         run(scene)
     found = run(scene, stiffness=20.0, rod_margin=0.1)
-    assert found.summary()["failures"] == 0
+    assert found.verdict() == ""
     plant = Plant(robot)
     plant.reset(found.x[0], found.pose)
     verdicts = [assess_stability(plant.equilibrium(x)) for x in found.x[::10]]

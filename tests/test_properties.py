@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import Counter
 from dataclasses import fields, replace
 
 import numpy as np
@@ -32,8 +33,9 @@ from .conftest import CONTROLLERS, MODELS
 from .rod_check import TOLERANCE, residuals
 
 PAIR = load_robot(MODELS / "planar_pair.toml")
+TUNING = replace(load_tuning(CONTROLLERS / "default.toml"), horizon=5, fallback="raise", max_iterations=4000)
 # What callers are told to expect; anything else is a crash.
-NAMED = (PCRError, ValueError, TypeError)
+NAMED = (PCRError, ValueError)
 PATIENCE = 20.0  # s for one call: a hang, not a timing
 
 
@@ -44,10 +46,22 @@ def cases(count):
     )  # fmt: skip
 
 
+@pytest.fixture
+def count():
+    """Of cases, and of those that came to the assertion: most, or the test says nothing."""
+    counted = Counter()
+    yield counted
+    assert counted["reached"] > 0.6 * counted["cases"] > 0, counted
+
+
+def mostly(ordinary, *others):
+    return st.integers(0, 7).flatmap(lambda k: others[k] if k < len(others) else ordinary)
+
+
 strange = st.sampled_from([0.0, -0.0, 5e-324, 1e-300, -1e-9, 1e8, 1e200, -1e200, math.inf, -math.inf, math.nan])
 tip = st.one_of(st.floats(-0.6, 0.6), strange)
-tips = st.one_of(
-    st.tuples(st.floats(-0.3, 0.3), st.floats(-0.4, 0.4)),
+tips = mostly(
+    st.tuples(st.floats(-0.2, 0.2), st.floats(-0.3, 0.3)),
     st.tuples(tip, tip),
     # Exactly at a base, and along a ray from it, up to full stretch.
     st.builds(
@@ -57,12 +71,17 @@ tips = st.one_of(
     ),
 )
 angle = st.one_of(st.floats(-4.0, 7.0), st.floats(-1e3, 1e3), strange)
-angles = st.one_of(st.tuples(st.floats(-4.0, 7.0), st.floats(-4.0, 4.0)), st.tuples(angle, angle))
+angles = mostly(st.tuples(st.floats(-4.0, 7.0), st.floats(-4.0, 4.0)), st.tuples(angle, angle))
+# Where every method works: about the pose with rods bowed outward.
+near_tips = mostly(st.tuples(st.floats(-0.05, 0.05), st.floats(0.2, 0.28)), tips)
+near_angles = mostly(st.tuples(st.floats(3.1, 3.6), st.floats(-0.4, 0.0)), angles)
 shapes = st.sampled_from([None, "text", 1.0, True, [], [0.1], [0.1, 0.2, 0.3], [[0.1, 0.2]], [None, 0.1], ["a", "b"]])
 
 
-def checked(call):
+def checked(call, count=None):
     """The result of a call, or None if it refused by name; fails on anything else."""
+    count = Counter() if count is None else count
+    count["cases"] += 1
     began = time.perf_counter()
     try:
         result = call()
@@ -70,6 +89,7 @@ def checked(call):
         result, words = None, str(error)
     else:
         words = "a result"
+        count["reached"] += 1
     assert time.perf_counter() - began < PATIENCE
     assert words
     return result
@@ -98,10 +118,10 @@ def test_the_judge_can_tell():
             require_equilibrium(replace(eq, **{field: spoiled}))
 
 
-@cases(1000)
+@cases(200)
 @given(tips, angles)
-def test_closed_form(p, q):
-    eq = checked(lambda: solve_statics(PAIR, p, q))
+def test_closed_form(count, p, q):
+    eq = checked(lambda: solve_statics(PAIR, p, q), count)
     if eq is not None:
         require_equilibrium(eq)
 
@@ -109,35 +129,35 @@ def test_closed_form(p, q):
 @pytest.mark.slow
 @cases(5000)
 @given(tips, angles)
-def test_closed_form_over_5000_more(p, q):
-    eq = checked(lambda: solve_statics(PAIR, p, q))
+def test_closed_form_over_5000_more(count, p, q):
+    eq = checked(lambda: solve_statics(PAIR, p, q), count)
     if eq is not None:
         require_equilibrium(eq)
 
 
-@cases(120)
-@given(tips, angles, st.integers(-1, 12), st.sampled_from([None, 0, 1, 2]))
-def test_multiple_shooting(p, q, segments, steps):
-    eq = checked(lambda: solve_statics(PAIR, p, q, method="multiple_shooting", segments=segments, steps=steps))
+@cases(40)
+@given(near_tips, near_angles, mostly(st.integers(4, 12), st.integers(-1, 3)), mostly(st.none(), st.integers(0, 2)))
+def test_multiple_shooting(count, p, q, segments, steps):
+    eq = checked(lambda: solve_statics(PAIR, p, q, method="multiple_shooting", segments=segments, steps=steps), count)
     if eq is not None and steps is None:
         require_equilibrium(eq)
 
 
 @cases(15)
-@given(tips, angles)
-def test_single_shooting(p, q):
-    eq = checked(lambda: solve_statics(PAIR, p, q, method="single_shooting"))
+@given(near_tips, near_angles)
+def test_single_shooting(count, p, q):
+    eq = checked(lambda: solve_statics(PAIR, p, q, method="single_shooting"), count)
     if eq is not None:
         require_equilibrium(eq)
 
 
-@cases(400)
-@given(tips, angles, tips, angles)
-def test_followed(p, q, p_end, q_end):
+@cases(120)
+@given(near_tips, near_angles, near_tips, near_angles)
+def test_followed(count, p, q, p_end, q_end):
     start = checked(lambda: solve_statics(PAIR, p, q))
     if start is None:
         return
-    end = checked(lambda: solve_statics(PAIR, p_end, q_end, guess=start))
+    end = checked(lambda: solve_statics(PAIR, p_end, q_end, guess=start), count)
     if end is not None:
         require_equilibrium(end)
 
@@ -156,30 +176,55 @@ def test_wrong_shapes_are_refused(p, q):
 
 
 number = st.one_of(st.floats(-1.0, 2.0), strange, st.sampled_from([True, "1", None]))
+rods = st.fixed_dictionaries(
+    {
+        "base": st.tuples(st.floats(-0.3, 0.3), st.floats(0.0, 0.05)),
+        "length": st.floats(0.2, 0.6),
+        "bending_stiffness": st.floats(1e-3, 1.0),
+        "line_density": st.floats(0.0, 0.1),
+        "angle_limits": st.just((-3.0, 3.0)),
+    }
+)
+numbers = st.fixed_dictionaries(
+    {
+        "tip_mass": st.floats(1e-3, 2.0),
+        "drag": st.floats(0.0, 1.0),
+        "rate_limit": st.floats(0.1, 10.0),
+        "acceleration_limit": st.floats(1.0, 1e3),
+        "torque_limit": st.floats(0.1, 10.0),
+    }
+)
+# At most one number of a sound robot is replaced.
+spoiled = mostly(
+    st.none(),
+    st.tuples(
+        st.sampled_from(["length", "bending_stiffness", "line_density", "tip_mass", "drag", "rate_limit"]), number
+    ),
+)
 
 
-@cases(2000)
-@given(st.lists(st.tuples(number, number, number, number), max_size=3), number, number, number)
-def test_robots_are_sound_or_refused(rods, mass, drag, rate):
-    def build():
-        return Robot(
-            name="generated",
-            rods=tuple(
-                Rod(base=(x, y), length=length, bending_stiffness=stiffness, angle_limits=(-3.0, 3.0))
-                for x, y, length, stiffness in rods
-            ),
-            tip_mass=mass, drag=drag, rate_limit=rate, acceleration_limit=100.0, torque_limit=1.0,
-        )  # fmt: skip
+@cases(40)
+@given(st.lists(rods, min_size=2, max_size=3), numbers, spoiled)
+def test_robots_are_sound_or_refused(count, rods, numbers, spoiled):
+    if spoiled is not None:
+        key, value = spoiled
+        (numbers if key in numbers else rods[0])[key] = value
 
-    robot = checked(build)
+    for k, rod in enumerate(rods):  # side by side
+        x, y = rod["base"]
+        rod["base"] = (x, y + 0.1 * k)
+
+    robot = checked(lambda: Robot(name="generated", rods=tuple(Rod(**rod) for rod in rods), **numbers), count)
     if robot is None:
         return
-    assert robot.rods
     assert (robot.lengths > 0).all()
     assert (robot.stiffnesses > 0).all()
     assert robot.tip_mass > 0
-    for centre in robot.bases:
-        eq = checked(lambda at=centre: solve_statics(robot, at + 0.3 * robot.lengths.min(), np.ones(robot.n_rods)))
+    assert robot.drag >= 0
+    assert np.isfinite([*robot.lengths, *robot.stiffnesses, robot.tip_mass, robot.drag, robot.rate_limit]).all()
+    at = robot.bases[0] + 0.3 * robot.lengths.min()
+    if min(robot.slacks(at)) > 0.0 and 1e-9 < robot.stiffnesses.min() and robot.stiffnesses.max() < 1e6:
+        eq = checked(lambda: solve_statics(robot, at, np.ones(robot.n_rods)))
         if eq is not None:
             require_equilibrium(eq)
 
@@ -203,48 +248,52 @@ def test_robot_files_are_read_or_refused(tmp_path_factory, key, value):
     assert not words or "generated.toml" in words
 
 
-@cases(1000)
+@cases(300)
 @given(
-    tips,
-    st.tuples(tip, tip),
-    angles,
-    st.tuples(tip, tip),
+    near_tips,
+    mostly(st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6)), st.tuples(tip, tip)),
+    near_angles,
+    mostly(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)), st.tuples(tip, tip)),
     st.sampled_from([1e-4, 1e-3, 0.05]),
     st.sampled_from(["none", "constant", "condensed"]),
 )
-def test_plant_and_linear_model(p, v, q, u, dt, inertia):
+def test_plant_and_linear_model(count, p, v, q, u, dt, inertia):
     plant = Plant(PAIR, inertia=inertia, dt=dt)
     x = [*p, *v, *q]
     if checked(lambda: plant.reset(x) or True) is None:
         return
-    moved = checked(lambda: plant.step(x, u))
+    moved = checked(lambda: plant.step(x, u), count)
     if moved is not None:
         assert np.isfinite(moved).all()
-    model = checked(lambda: linearise(plant, x, u, dt))
+    model = checked(lambda: linearise(plant, x, u, dt), count)
     if model is not None:
         assert all(np.isfinite(block).all() for block in (model.A, model.B, model.c, model.E))
 
 
-@cases(300)
-@given(st.lists(tip, min_size=6, max_size=6), st.tuples(tip, tip), st.tuples(tip, tip))
-def test_mpc(x, previous, wanted):
-    tuning = replace(load_tuning(CONTROLLERS / "default.toml"), horizon=5, fallback="raise")
+@cases(100)
+@given(
+    mostly(st.lists(st.floats(-0.6, 0.6), min_size=6, max_size=6), st.lists(tip, min_size=6, max_size=6)),
+    mostly(st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6)), st.tuples(tip, tip)),
+    mostly(st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6)), st.tuples(tip, tip)),
+)
+def test_mpc(count, x, previous, wanted):
     a = np.eye(6) + 0.01 * np.eye(6, k=2)
     model = LinearModel(a, 0.01 * np.eye(6, 2, k=-4), np.zeros(6), np.zeros((6, 2)), 0.01, np.zeros(2))
-    mpc = LinearMPC(tuning, Limits(7.0, 1.0, np.full(2, -2.0), np.full(2, 5.0)))
+    mpc = LinearMPC(TUNING, Limits(7.0, 1.0, np.full(2, -2.0), np.full(2, 5.0)))
     reference = Reference(np.tile([*wanted, 0, 0, 0, 0], (5, 1)), np.zeros((5, 2)))
-    plan = checked(lambda: mpc.solve(np.array(x), model, reference, np.array(previous)))
+    plan = checked(lambda: mpc.solve(np.array(x), model, reference, np.array(previous)), count)
     if plan is not None:
         assert np.isfinite(plan.inputs).all()
         assert np.abs(plan.inputs[0]).max() <= 7.0
+        assert np.abs(plan.inputs[0] - previous).max() <= 1.0 + 1e-12
 
 
 @pytest.mark.slow
 @cases(60)
 @given(tips, angles)
-def test_free_tips(p, q):
+def test_free_tips(count, p, q):
     for call in (lambda: forward_statics(PAIR, q), lambda: inverse_statics(PAIR, p)):
-        eq = checked(call)
+        eq = checked(call, count)
         if eq is not None:
             require_equilibrium(eq)
             assert eq.stable

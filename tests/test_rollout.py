@@ -132,6 +132,20 @@ def test_many_robots(pair, centre, threads):
     assert alike.x[3] == pytest.approx(result.x[3], abs=1e-10)
 
 
+def test_every_robot_has_its_own_force_at_every_step(pair, centre):
+    x = np.stack([start_at(centre)] * 3)
+    gusts = np.random.default_rng(6).uniform(-1.0, 1.0, (3, 20, 2))
+    plant = Plant(pair, integrator="velocity_verlet")
+    for inputs in (np.zeros((20, 2)), np.random.default_rng(7).uniform(-2.0, 2.0, (3, 20, 2))):
+        result = rollout(plant, x, inputs, gusts, guess=centre)
+        for i, own in enumerate(np.broadcast_to(inputs, (3, 20, 2))):
+            assert result.x[i] == pytest.approx(one_by_one(plant, x[i], own, gusts[i], centre), abs=1e-10)
+    # One start for all, and robots from the forces alone.
+    assert rollout(plant, x[0], np.zeros((20, 2)), gusts, guess=centre).x.shape == (3, 21, 6)
+    with pytest.raises(ValueError, match=r"f_ext has shape \(2, 20, 2\), expected \(3, 20, 2\)"):
+        rollout(plant, x, np.zeros((20, 2)), gusts[:2], guess=centre)
+
+
 def test_more_steps_than_one_call_takes(pair, centre, monkeypatch):
     monkeypatch.setattr("pcr_mpc.plant.rollout._STEPS", 25)
     monkeypatch.setattr("pcr_mpc.plant.rollout._MOST_STEPS", 50)

@@ -35,9 +35,9 @@ def test_each_is_used_and_says_where_it_comes_from(path):
     assert float(re.search(r"# Score ([\d.]+) on other episodes", text)[1]) < 1.0
 
 
-def test_the_main_job_is_done_to_eight_micrometres():
+def test_the_main_job_is_done_to_two_micrometres():
     found = summary("lemniscate", duration=2.0)
-    assert found["rms_after_1s_mm"] <= 0.008
+    assert found["rms_after_1s_mm"] <= 0.0022
     assert (found["failures"], found["limit_violations"], found["fallbacks"]) == (0, 0, 0)
 
 
@@ -47,10 +47,22 @@ def test_the_offset_of_an_unknown_load_is_gone():
     assert found["limit_violations"] == 0
 
 
-def test_it_beats_the_default_on_an_episode_that_no_search_has_seen():
-    """One of those that are lost with the default."""
-    scene, known = to_tune(MODELS / "scenes" / "pick_and_place.toml")
-    scene = lighter(scene)
-    costs, start = (measure(scene, scene.tuning, one, [107], Spread()) for one in (known, scene.tuning))
+@pytest.mark.slow
+def test_it_beats_the_default_on_episodes_that_no_search_has_seen():
+    """One of these twelve is lost with the default, none with what was found."""
+    costs, start = compared(range(100, 112))
     assert start.failure_rate > 0.0 == costs.failure_rate
     assert score(costs, start) < 0.5
+
+
+def test_it_is_calmer_than_the_default_on_every_episode():
+    costs, start = compared([104])
+    assert costs.failure_rate == start.failure_rate == 0.0
+    assert costs.effort_rad_s2 < 0.8 * start.effort_rad_s2
+    assert costs.nominal_mm < 0.5 * start.nominal_mm
+
+
+def compared(seeds):
+    scene, known = to_tune(MODELS / "scenes" / "pick_and_place.toml")
+    scene = lighter(scene)
+    return (measure(scene, scene.tuning, one, list(seeds), Spread()) for one in (known, scene.tuning))

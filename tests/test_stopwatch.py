@@ -1,11 +1,11 @@
 """Times are sorted into the right drawers."""
 
 import gc
-import time
 
 import numpy as np
 import pytest
 
+from pcr_mpc.study import stopwatch
 from pcr_mpc.study.stopwatch import WARM_UP, Times, measure
 
 
@@ -30,27 +30,72 @@ def test_record_keeps_the_first_calls_apart():
     assert record["collections"]["share"] == pytest.approx(4e-5 / wall[collecting].sum())
 
 
-def test_measure_times_the_call_alone_with_the_collector_on_and_off_in_turns():
-    seen = []
+class Clock:
+    """Time that passes only where a test says so: elapsed and spent by the thread."""
+
+    def __init__(self):
+        self.elapsed = self.spent = 0.0
+
+    def pass_by(self, elapsed, spent):
+        self.elapsed += elapsed
+        self.spent += spent
+
+    def perf_counter(self):
+        return self.elapsed
+
+    def thread_time(self):
+        return self.spent
+
+
+def test_measure_times_the_call_alone_with_the_collector_on_and_off_in_turns(monkeypatch):
+    seen, clock = [], Clock()
+    monkeypatch.setattr(stopwatch, "time", clock)
+
+    def passing(phase, info):  # a collection takes 2 ms
+        if phase == "stop":
+            clock.pass_by(2e-3, 2e-3)
 
     def call(k):
         seen.append((k, gc.isenabled()))
+        clock.pass_by(1e-4, 1e-4)
         if k == 3:
             gc.collect()
         if k == 5:
-            time.sleep(0.01)
+            clock.pass_by(0.01, 0.0)  # asleep
 
     def before(k):
         if k == 4:
             gc.collect()
-            time.sleep(0.01)
+            clock.pass_by(0.01, 0.0)
 
-    assert gc.isenabled()
-    times = measure(call, 600, before)
-    assert gc.isenabled()
+    was_on = gc.isenabled()
+    gc.disable()  # no collections but those above: of others nobody knows when they come
+    monkeypatch.setattr(gc, "enable", lambda: None)
+    gc.callbacks.insert(0, passing)
+    try:
+        times = measure(call, 600, before)
+    finally:
+        gc.callbacks.remove(passing)
+        monkeypatch.undo()
+        (gc.enable if was_on else gc.disable)()
     assert [k for k, _ in seen] == list(range(600))
-    assert [on for _, on in seen] == times.collecting.tolist() == [True] * 500 + [False] * 100
-    assert len(times.pauses) == 1
-    assert 0 < times.pauses[0] < times.wall[3]
-    assert times.wall[5] > 0.01 > times.cpu[5]
-    assert times.wall[4] < times.wall[5]
+    wall, cpu = np.full(600, 1e-4), np.full(600, 1e-4)
+    wall[3] = cpu[3] = 2.1e-3
+    wall[5] = 0.0101
+    assert times.wall == pytest.approx(wall, abs=1e-12)
+    assert times.cpu == pytest.approx(cpu, abs=1e-12)
+    assert times.pauses == pytest.approx([2e-3], abs=1e-12)
+
+
+def test_the_collector_is_on_and_off_in_turns_and_as_it_was_afterwards():
+    seen = []
+    assert gc.isenabled()
+    times = measure(lambda k: seen.append(gc.isenabled()), 600)
+    assert gc.isenabled()
+    assert seen == times.collecting.tolist() == [True] * 500 + [False] * 100
+    gc.disable()
+    try:
+        measure(lambda k: None, 600)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()

@@ -51,6 +51,7 @@ class _OneStep(ABC):
         self.tuning = tuning
         self.limits = limits
         self._model: LinearModel | None = None
+        self._dt = 1.0  # of any model; until there is one, motors are only brought to rest
 
     def reset(self) -> None:  # noqa: B027  it remembers nothing
         """See `Law`."""
@@ -83,13 +84,13 @@ class _OneStep(ABC):
     ) -> Plan:
         """See `Law`."""
         wanted = self._rates(x, reference)
-        u = self.limits.clipped(self.limits.within_stops(wanted, x[4:], self._dt), u_previous)
+        u = self.limits.kept(wanted, u_previous, x[4:], self._dt)
         active = () if np.array_equal(u, wanted) else self.limits.met_by(u, u_previous)
         return Plan(u[None], None, models, "solved", None, active)
 
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """See `Law`: the motors are brought to rest."""
-        u = self.limits.clipped(np.zeros(len(u_previous)), u_previous)
+        u = self.limits.kept(np.zeros(len(u_previous)), u_previous, x[4:], self._dt)
         return Plan(u[None], None, None, status, "hold")
 
 
@@ -101,7 +102,8 @@ class FeedForward(_OneStep):
 
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """See `Law`: it needs no measurement."""
-        return Plan(self.limits.clipped(reference.inputs[0], u_previous)[None], None, None, "solved")
+        u = self.limits.kept(reference.inputs[0], u_previous, x[4:], self._dt)
+        return Plan(u[None], None, None, "solved")
 
 
 class LQR(_OneStep):

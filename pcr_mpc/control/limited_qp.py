@@ -16,9 +16,9 @@ from .osqp_solver import QPSolver, Solution
 from .qp import QuadraticProgram, constraint_matrix
 from .tuning import Tuning
 
-# Price of a limit that gives way, per square root of the position weight. The penalty is exact while it exceeds every
-# multiplier, and those are what a limit costs in the root of the tracking cost: 0.2 is a detour of 20 cm for a period.
-_PENALTY = 0.2
+# Price of a limit that gives way by a radian, over the cost of the tip's way per radian. The penalty is exact while it
+# exceeds every multiplier, and those are what a limit costs in tracking: 15 is a detour of 7.5 such ways for a period.
+_PENALTY = 15.4
 _TOLERANCE = 10.0  # times the tuning's: the rows are scaled, and the inputs still right to 0.01 rad/s
 _SLACK_SEEN = 1e-4  # rad or units of a row: less is the solver's tolerance
 
@@ -69,14 +69,17 @@ class LimitedQP:
         Control period [s].
     kinds : tuple of str
         Of the rows of the `LinearLimits` to come; empty if there are none.
+    reach : float
+        Way of the tip per radian [m/rad] (see `LinearModel`), which makes prices of angles from those of positions.
     """
 
-    def __init__(self, tuning: Tuning, n: int, dt: float, kinds: tuple[str, ...] = ()) -> None:
+    def __init__(self, tuning: Tuning, n: int, dt: float, kinds: tuple[str, ...] = (), *, reach: float) -> None:
         horizon, size = tuning.horizon, tuning.horizon * n
         self._horizon, self._n, self._dt, self._size = horizon, n, dt, size
         self._kinds = kinds
         self._motor_rows = np.asfortranarray(constraint_matrix(horizon, n).toarray())
-        self._penalty = _PENALTY * np.sqrt(tuning.position_weight)
+        # Slacks are those of the rows, over dt.
+        self._penalty = _PENALTY * tuning.position_weight * reach**2 * dt
         self._groups = np.array(
             [kind for kind in ("rate", "rate change", "angle") for _ in range(size)] + [*kinds] * horizon
         )
@@ -141,7 +144,8 @@ class LimitedQP:
             lower, upper = np.concatenate([lower, low]), np.concatenate([upper, high])
         factor = self._factor(qp)
         rows = dtrsm(1.0, factor, rows, side=1, lower=1, trans_a=1)  # A inv(L')
-        length = np.maximum(np.linalg.norm(rows, axis=1), 1e-12)
+        length = np.linalg.norm(rows, axis=1)
+        length = np.maximum(length, 1e-12 * length.max())
         rows /= length[:, None]
         self._data[self._dense] = rows.ravel(order="F")
         slackest = np.full(soft, np.inf)

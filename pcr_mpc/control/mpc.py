@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import control
 import numpy as np
+from scipy.linalg import solve_discrete_are
 from scipy.linalg.blas import dnrm2
 
 from ..errors import InfeasibleError, checked_array, checked_vector
 from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel, LinearModels
+from .condensing import condensing
 from .plan import Plan
 from .qp import QuadraticProgram, Reference, assemble, model_sequence
 from .tuning import Limits, Tuning
@@ -23,6 +25,7 @@ from .workspace import Workspace
 _NOT_OF_THE_PROBLEM = ("name", "fallback", "model", "observer", "pd", "period")  # fields of a tuning
 # Between the sizes of one problem and the next: then the last one says nothing about this one.
 _JUMP = 1e3
+_LONG = 24  # periods
 _POSES = 30.0  # at most between entries of linear models of one robot
 _SLIGHT = 1e-6  # of the greatest rates: a gradient that asks for less is rounding
 
@@ -54,19 +57,19 @@ class LinearMPC:
         self._terminal_weight: np.ndarray | None = None
         self._gain: np.ndarray | None = None
         self._last: Plan | None = None
-        self._age = 0  # periods since the last plan was solved
+        self._age = math.inf  # periods since a plan was solved
         self._prepared: tuple[LinearModel, Sequence[tuple[str, ...]]] | None = None
         self._first: LinearModel | None = None  # whose terminal weight it is, if nobody called prepare
         self._problem: tuple[Limits, float, float] | None = None  # limits and sizes of the last problem
 
     def reset(self) -> None:
         """Start afresh: the same calls then give the same plans, bit for bit."""
-        self._terminal_weight = self._first = self._prepared = None
+        self._gain = self._terminal_weight = self._first = self._prepared = None
         self._forget()
 
     def _forget(self) -> None:
         """Forget the last plan and its problem."""
-        self._last, self._age, self._problem = None, 0, None
+        self._last, self._age, self._problem = None, math.inf, None
         if self._workspace is not None:
             self._workspace.reset()
 
@@ -80,8 +83,21 @@ class LinearMPC:
         self._prepared = model, combinations
         if self._workspace is None:
             self._workspace = Workspace(self.tuning, model)
-        for kinds in ((), *combinations):
-            self._workspace.limited(kinds)
+        # For a long horizon a solver takes a second to set up: then those that are needed are made where they are.
+        if self.tuning.horizon <= _LONG:
+            for kinds in ((), *combinations):
+                self._workspace.limited(kinds)
+
+    def condensing(self, n: int, models: int) -> Any:
+        """Graph that assembles the QP for n motors from 1 or N models (see `condensing`)."""
+        tuning = self.tuning
+        return condensing(tuning.horizon, n, models, velocity=tuning.velocity_weight > 0, angle=tuning.angle_weight > 0)
+
+    @property
+    def terminal(self) -> np.ndarray:
+        """Terminal weight, from `prepare` on, shape (4 + n, 4 + n)."""
+        assert self._terminal_weight is not None
+        return self._terminal_weight
 
     def retune(self, tuning: Tuning) -> None:
         """Let another tuning take effect, all of it, between two steps.
@@ -190,9 +206,8 @@ class LinearMPC:
             status, fallback = f"cannot keep {', '.join(answer.slack)}", "softened"
         solved = time.perf_counter()
         inputs = answer.inputs.reshape(-1, n)
-        # OSQP keeps limits to its tolerance, this keeps them exactly.
-        inside = inputs[0] if fallback else self.limits.within_stops(inputs[0], x[4:], models.dt)
-        first_rates = self.limits.clipped(inside, u_previous)
+        # OSQP keeps limits to its tolerance and within its horizon, this keeps them exactly and ever after.
+        first_rates = self.limits.kept(inputs[0], u_previous, x[4:], models.dt)
         states = answer.states
         if states is None or inputs[0].tolist() != first_rates.tolist():
             inputs[0] = first_rates
@@ -244,15 +259,15 @@ class LinearMPC:
             inputs = _shifted(self._last.inputs)
         elif self._gain is not None and np.isfinite(x).all():
             fallback = "lqr"
-            inputs[0] = self.limits.within_stops(lqr_rates(self._gain, x, reference, self._dt), x[4:], self._dt)
+            inputs[0] = lqr_rates(self._gain, x, reference, self._dt)
         else:
             fallback = "hold"
-        inputs[0] = wanted = self.limits.clipped(asked := inputs[0].copy(), u_previous)
+        inputs[0] = wanted = self.limits.kept(asked := inputs[0].copy(), u_previous, x[4:], self._dt)
         if fallback == "shifted_plan":
-            inputs[-1] = self.limits.clipped(np.zeros(n), inputs[-2] if len(inputs) > 1 else inputs[0])
+            inputs[-1] = self.limits.slowed(inputs[-2] if len(inputs) > 1 else inputs[0])
         else:
             for k in range(1, len(inputs)):
-                inputs[k] = self.limits.clipped(np.zeros(n), inputs[k - 1])
+                inputs[k] = self.limits.slowed(inputs[k - 1])
         self._age += 1
         models, states = None, None
         if self._last is not None and self._last.models is not None and np.isfinite(x).all():
@@ -269,15 +284,30 @@ def terminal_weight(model: LinearModel, tuning: Tuning) -> np.ndarray:
     return riccati(model, tuning)[1]
 
 
+_UNSEEN = 7.7e-5  # weight on angles that the tip does not see, over that on the way that they move it
+
+
 def riccati(model: LinearModel, tuning: Tuning) -> tuple[np.ndarray, np.ndarray]:
-    """Gain (n, 4 + n) and cost-to-go (4 + n, 4 + n) of the unconstrained LQR."""
+    """Gain (n, 4 + n) and cost-to-go (4 + n, 4 + n) of the unconstrained LQR.
+
+    The equation is solved in the model's own units, the way of the tip per radian and the period, in which similar
+    robots have the same numbers.
+    """
     n_states, n = model.B.shape
+    reach = model.reach
+    units = np.array([reach] * 2 + [reach / model.dt] * 2 + [1.0] * (n_states - 4))
     # A little weight on the angles keeps the Riccati equation solvable where the tip does not see them all
     # (more than two motors), and changes the gains by less than 0.1 %.
-    angle = max(tuning.angle_weight, 1e-6 * tuning.position_weight)
-    stage = np.diag([tuning.position_weight] * 2 + [tuning.velocity_weight] * 2 + [angle] * (n_states - 4))
-    gain, cost, _ = control.dlqr(model.A, model.B, stage, tuning.input_weight * np.eye(n))
-    return np.asarray(gain), np.asarray(cost)
+    position = tuning.position_weight * reach**2
+    angle = max(tuning.angle_weight, _UNSEEN * position)
+    velocity = tuning.velocity_weight * (reach / model.dt) ** 2
+    stage = np.diag([position] * 2 + [velocity] * 2 + [angle] * (n_states - 4)) / position
+    a, b = model.A * units / units[:, None], model.B / units[:, None] / model.dt
+    r = tuning.input_weight / (position * model.dt**2) * np.eye(n)
+    # SciPy itself, as python-control would call it: that one takes seconds to import.
+    cost = solve_discrete_are(a, b, stage, r, s=np.zeros((n_states, n)))
+    gain = np.linalg.solve(b.T @ cost @ b + r, b.T @ cost @ a)
+    return np.asarray(gain / units / model.dt), np.asarray(position * cost / np.outer(units, units))
 
 
 def lqr_rates(gain: np.ndarray, x: np.ndarray, reference: Reference, dt: float) -> np.ndarray:

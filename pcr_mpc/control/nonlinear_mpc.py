@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -67,6 +68,7 @@ class NonlinearMPC:
         self._dynamics, self._algebraic = dynamics, algebraic
         self._points, self._max_iterations = points, max_iterations
         self._n = dynamics.size1_in("q")
+        self._dt = 1.0  # of any model; until there is one, motors are only brought to rest
         self._nlp: Transcription | None = None
         self._terminal_weight: np.ndarray | None = None
         self.reset()
@@ -74,7 +76,7 @@ class NonlinearMPC:
     def reset(self) -> None:
         """Start afresh: the same calls then give the same plans."""
         self._last: Plan | None = None
-        self._age = 0  # periods since the last plan was solved
+        self._age = math.inf  # periods since a plan was solved
         self._point: Point | None = None
         self._terminal_weight = None
         self._prepared: LinearModel | None = None
@@ -171,7 +173,7 @@ class NonlinearMPC:
         self._point, self._age = solution.point, 0
         rows = solution.point.unknowns
         inputs, predicted = rows[:, :n].copy(), np.vstack([x, rows[:, -n_states:]])
-        inputs[0] = self.limits.clipped(inputs[0], u_previous)
+        inputs[0] = self.limits.kept(inputs[0], u_previous, x[4:], self._dt)
         agreeing = replace(model, c=model.c + predicted[1] - model(x, inputs[0]))
         times = updated - began, time.perf_counter() - updated
         return self._remember(inputs, predicted, agreeing, "solved", None, solution, times)
@@ -204,9 +206,9 @@ class NonlinearMPC:
             inputs[:-1] = self._last.inputs[1:]
             if self._last.states is not None:
                 predicted[:-1] = self._last.states[1:]
-        inputs[0] = self.limits.clipped(inputs[0], u_previous)
+        inputs[0] = self.limits.kept(inputs[0], u_previous, x[4:], self._dt)
         for k in range(planned, horizon):
-            inputs[k] = self.limits.clipped(np.zeros(n), inputs[k - 1])
+            inputs[k] = self.limits.slowed(inputs[k - 1])
         self._age += 1
         models = None if self._last is None else self._last.models
         predicted[0] = x

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
-import control
+import casadi as ca
 import numpy as np
+from scipy.linalg import solve_discrete_are
 
+from ..buffered import BufferedFunction, graph_cache
+from ..errors import checked_number
 from ..linearisation.linear_model import LinearModel
 
 
@@ -27,6 +31,10 @@ class ObserverTuning:
     tip_noise: float = 1e-5
     force_noise: float = 0.01
     force_walk: float = 0.005
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            object.__setattr__(self, field.name, checked_number(field.name, getattr(self, field.name), above=0.0))
 
 
 class DisturbanceObserver:
@@ -49,12 +57,17 @@ class DisturbanceObserver:
         Estimate of the state.
     force : ndarray, shape (2,)
         Estimate of the unknown force [N].
+    gain : ndarray, shape (6, 2)
+        What a surprise in the tip position says about [p, v, d].
+    half_step : float
+        Half the resolution of the encoders [rad].
     """
 
     def __init__(self, tuning: ObserverTuning, tip_noise: float, angle_step: float, model: LinearModel) -> None:
         n = model.B.shape[1]
         self.gain = _gain(tuning, max(tip_noise, tuning.tip_noise), model)
-        self._half_step = angle_step / 2
+        self.half_step = angle_step / 2
+        self._correct = BufferedFunction(correction(n))
         self.x = np.zeros(4 + n)
         self.force = np.zeros(2)
 
@@ -62,19 +75,40 @@ class DisturbanceObserver:
         """Begin at a known state, without a force."""
         self.x, self.force = x.copy(), np.zeros(2)
 
-    def correct(self, p: np.ndarray, q: np.ndarray) -> None:
-        """Take in a measurement of the tip [m] and the motor angles [rad].
+    def correct(self, p: np.ndarray | None, q: np.ndarray | None) -> None:
+        """Take in a measurement of the tip [m] and the motor angles [rad]; None: there is none.
 
         An encoder says in which interval the angle is; within it the prediction, which knows the commands, is better.
         """
-        change = self.gain @ (p - self.x[:2])
-        self.x[:4] += change[:4]
-        self.force += change[4:]
-        self.x[4:] = np.minimum(np.maximum(self.x[4:], q - self._half_step), q + self._half_step)
+        estimate, measured, gain, half_step = self._correct.inputs
+        estimate[:-2], estimate[-2:] = self.x, self.force
+        measured[:2], measured[2:] = self.x[:2] if p is None else p, self.x[4:] if q is None else q
+        gain[:], half_step[:] = self.gain, self.half_step
+        self._correct()
+        self.take(self._correct.outputs[0])
+
+    def take(self, corrected: np.ndarray) -> None:
+        """Take over a state and force that `correction` has found."""
+        self.x, self.force = corrected[:-2].copy(), corrected[-2:].copy()
+
+    def move(self, p: np.ndarray, v: np.ndarray) -> None:
+        """Begin anew with the tip elsewhere, at position p [m] and velocity v [m/s], and no force suspected."""
+        self.x[:2], self.x[2:4], self.force = p, v, np.zeros(2)
 
     def predict(self, model: LinearModel, u: np.ndarray) -> None:
         """Move on by one period in which the rates u are applied; ``model`` must know the force."""
         self.x = model(self.x, u)
+
+
+@graph_cache()
+def correction(n: int) -> Any:
+    """Graph ([x, force] (6 + n), measured [p, q] (2 + n), gain (6, 2), half step of the encoders) -> [x, force]."""
+    estimate, measured = ca.MX.sym("estimate", 6 + n), ca.MX.sym("measured", 2 + n)
+    gain, half_step = ca.MX.sym("gain", 6, 2), ca.MX.sym("half_step")
+    change = gain @ (measured[:2] - estimate[:2])
+    angles = ca.fmin(ca.fmax(estimate[4:-2], measured[2:] - half_step), measured[2:] + half_step)
+    corrected = ca.vertcat(estimate[:4] + change[:4], angles, estimate[-2:] + change[4:])
+    return ca.Function("correct", [estimate, measured, gain, half_step], [corrected])
 
 
 def _gain(tuning: ObserverTuning, tip_noise: float, model: LinearModel) -> np.ndarray:
@@ -83,9 +117,14 @@ def _gain(tuning: ObserverTuning, tip_noise: float, model: LinearModel) -> np.nd
     noise = np.block([[model.E[:4], np.zeros((4, 2))], [np.zeros((2, 2)), np.eye(2)]])
     covariance = np.diag([tuning.force_noise**2] * 2 + [tuning.force_walk**2] * 2)
     output = np.eye(2, 6)
-    # In units of the tip's noise: the Riccati equation of 1e-10 m^2 is badly scaled.
-    scale = tip_noise**2
-    driven = noise @ (covariance / scale) @ noise.T
-    _, error, _ = control.dlqe(a, np.eye(6), output, (driven + driven.T) / 2, np.eye(2))
-    # control's gain predicts; this one corrects.
-    return np.asarray(error @ output.T @ np.linalg.inv(output @ error @ output.T + np.eye(2)))
+    # In units of the tip's noise, the period and the force that moves the tip by as much in it: the Riccati equation
+    # of 1e-10 m^2 is badly scaled, and similar robots then have the same numbers.
+    push = tip_noise / float(np.linalg.norm(model.E[:2], 2))
+    units = np.array([tip_noise] * 2 + [tip_noise / model.dt] * 2 + [push] * 2)
+    a = a * units / units[:, None]
+    noise = noise / units[:, None]
+    driven = noise @ covariance @ noise.T
+    error = solve_discrete_are(a.T, output.T, (driven + driven.T) / 2, np.eye(2))
+    # Not the gain that predicts, but the one that corrects.
+    gain = error @ output.T @ np.linalg.inv(output @ error @ output.T + np.eye(2))
+    return np.asarray(units[:, None] / tip_noise * gain)

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import checked_number
+from ..errors import ModelError, checked_integer, checked_number, checked_vector
+from ..files import name_problem
 from ..frozen import Frozen
+from ..methods import METHODS
 from ..toml_table import read_toml
 from .observer import ObserverTuning
 
-METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 SCHEMES = ("rk4", "rk8")
 LAWS = ("linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward")
 LINEARISE = ("here", "along_plan")
 INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
+# Two sums of the same commands differ by rounding [rad].
+_SAME_ANGLE = 1e-9
+# Matrices grow with the square of the horizon: at this one they are made in half a minute.
+LONGEST_HORIZON = 400
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,17 @@ class Model:
     predict_delay: bool = True
     compiled: bool = True
 
+    def __post_init__(self) -> None:
+        for name in ("segments", "steps"):
+            object.__setattr__(self, name, checked_integer(name, getattr(self, name)))
+        for name, choices in (
+            ("method", METHODS),
+            ("scheme", SCHEMES),
+            ("inertia", INERTIAS),
+            ("linearise", LINEARISE),
+        ):
+            _check_choice(name, getattr(self, name), choices)
+
 
 @dataclass(frozen=True)
 class Tuning:
@@ -65,7 +83,7 @@ class Tuning:
     input_weight : float
         On deviations of the motor rates from the feed-forward [1/(rad/s)^2].
     tolerance : float
-        OSQP's absolute and relative tolerance.
+        OSQP's absolute and relative tolerance; the absolute one is of rates [rad/s].
     max_iterations : int
         After which OSQP gives up.
     fallback : {"ladder", "raise"}
@@ -97,16 +115,25 @@ class Tuning:
 
     def __post_init__(self) -> None:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
-        if self.law not in LAWS:
-            raise ValueError(f"law is {self.law!r}, expected one of {', '.join(LAWS)}")
+            object.__setattr__(self, name, checked_integer(name, count))
+        if problem := name_problem(self.name):
+            raise ModelError(f"name: {problem}", key="name")
+        if problem := _horizon_problem(self.horizon):
+            raise ModelError(f"horizon {problem}", key="horizon")
+        _check_choice("law", self.law, LAWS)
         for name in ("position_weight", "input_weight", "tolerance"):
-            checked_number(name, getattr(self, name), above=0.0)
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), above=0.0))
         for name in ("velocity_weight", "angle_weight"):
-            checked_number(name, getattr(self, name), minimum=0.0)
-        if self.fallback not in FALLBACKS:
-            raise ValueError(f"fallback is {self.fallback!r}, expected one of {', '.join(FALLBACKS)}")
+            object.__setattr__(self, name, checked_number(name, getattr(self, name), minimum=0.0))
+        _check_choice("fallback", self.fallback, FALLBACKS)
+        object.__setattr__(self, "pd", tuple(checked_vector("pd", self.pd, 2).tolist()))
+        if self.period is not None:
+            object.__setattr__(self, "period", checked_number("period", self.period, above=0.0))
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,23 +166,81 @@ class Limits(Frozen):
             object.__setattr__(self, name, angles.astype(float))  # a copy, the limits' own
         super().__post_init__()
 
-    def clipped(self, u: np.ndarray, u_previous: np.ndarray) -> np.ndarray:
-        """Rates nearest to u that meet the limits on rate and change exactly; OSQP meets them to its tolerance."""
-        rate, change = self.rate, self.rate_change  # on a few floats Python is faster than NumPy
-        pairs = zip(u.tolist(), u_previous.tolist(), strict=True)
-        return np.array(
-            [max(-rate, min(rate, max(before - change, min(before + change, now)))) for now, before in pairs]
-        )
+    def kept(
+        self, u: np.ndarray, u_previous: np.ndarray, q: np.ndarray, dt: float, reckoned: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Rates nearest to u that keep all limits now, and leave every motor able to stop before its stop.
 
-    def within_stops(self, u: np.ndarray, q: np.ndarray, dt: float) -> np.ndarray:
-        """Rates nearest to u that keep the angles within their limits for one period."""
-        each = zip(u.tolist(), q.tolist(), self.angle_lower.tolist(), self.angle_upper.tolist(), strict=True)
-        return np.array([max((low - at) / dt, min((high - at) / dt, rate)) for rate, at, low, high in each])
+        A motor that turns at u may slow down by ``rate_change`` in each period from the next one on, and what it turns
+        meanwhile must fit too; so what is kept once can be kept ever after. Where a start does not allow that,
+        because a motor is too fast for its stop or beyond it, the limit on the rate has priority, then that on its
+        change: the motor brakes, or comes back, as fast as these two allow.
+
+        Parameters
+        ----------
+        u, u_previous : ndarray, shape (n,)
+            Wanted rates, and those of the last period [rad/s].
+        q : ndarray, shape (n,)
+            Motor angles at the start of the period [rad]; what is not finite has no stop.
+        dt : float
+            Period [s].
+        reckoned : ndarray, shape (n,), optional
+            The angles by another opinion [rad], as the sum of the commands is one: stops are kept for both. Where only
+            one of them is beyond a stop, the motor goes no further, but is not sent back.
+        """
+        rate, change = self.rate, self.rate_change  # on a few floats Python is faster than NumPy
+        found = []
+        each = zip(u.tolist(), u_previous.tolist(), q.tolist(), self.angle_lower.tolist(), self.angle_upper.tolist(),
+                   q.tolist() if reckoned is None else reckoned.tolist(), strict=True)  # fmt: skip
+        for now, before, at, lower, upper, also in each:
+            if math.isfinite(at):
+                low, high = at, at
+                if abs(also - at) > _SAME_ANGLE:
+                    low, high = min(at, also), max(at, also)
+                most = self._fastest((upper - high) / dt, (upper - low) / dt)
+                least = -self._fastest((low - lower) / dt, (high - lower) / dt)
+                now = max(least, min(most, now))
+            found.append(max(-rate, min(rate, max(before - change, min(before + change, now)))))
+        return np.array(found)
+
+    def slowed(self, u: np.ndarray) -> np.ndarray:
+        """Rates one period after the rates u of motors that brake as hard as they may."""
+        change = self.rate_change
+        return np.array([max(before - change, min(before + change, 0.0)) for before in u.tolist()])
+
+    def _fastest(self, room: float, most_room: float) -> float:
+        """Greatest rate towards a stop from which a motor can brake in time; negative where it must come back.
+
+        ``room`` is the way to the stop over dt, ``most_room`` the same by the more hopeful opinion [rad/s]. A rate u
+        needs u + (u - c) + (u - 2c) + .., as long as these are positive, with c the change of rate.
+        """
+        if room < 0.0:
+            return min(0.0, most_room)
+        if room >= self._clear:
+            return self.rate
+        if math.isinf(self.rate_change):
+            return room
+        steps = math.floor((math.sqrt(1.0 + 8.0 * room / self.rate_change) - 1.0) / 2.0)
+        return room / (steps + 1) + self.rate_change * steps / 2.0
+
+    @cached_property
+    def _clear(self) -> float:
+        """Way over dt from which even the greatest rate can be braked [rad/s]."""
+        if math.isinf(self.rate) or math.isinf(self.rate_change):
+            return self.rate
+        steps = math.floor(self.rate / self.rate_change)
+        return (steps + 1) * (self.rate - self.rate_change * steps / 2.0)
 
     def met_by(self, u: np.ndarray, u_previous: np.ndarray) -> tuple[str, ...]:
         """Which limits the clipped rates u meet: on the rate, on its change, or else on an angle."""
         met = {"rate": np.abs(u) >= self.rate, "rate change": np.abs(u - u_previous) >= self.rate_change - 1e-12}
         return tuple(kind for kind, where in met.items() if where.any()) or ("angle",)
+
+
+def _horizon_problem(horizon: int) -> str | None:
+    if horizon <= LONGEST_HORIZON:
+        return None
+    return f"is {horizon}, expected at most {LONGEST_HORIZON}; take a longer period to look further"
 
 
 def load_tuning(path: str | Path) -> Tuning:
@@ -184,12 +269,17 @@ def load_tuning(path: str | Path) -> Tuning:
         predicts, weighs = law.endswith("mpc"), law.endswith("mpc") or law == "lqr"
         gains = (pd.number("position"), pd.number("velocity", 0.0)) if law == "pd" else (0.0, 0.0)
         period = file.number("period", 0.0, minimum=0.0)
+        horizon, name = file.integer("horizon") if predicts else 1, file.text("name")
+        if problem := name_problem(name):
+            raise file.fail("name", problem)
+        if problem := _horizon_problem(horizon):
+            raise file.fail("horizon", problem)
         return Tuning(
-            name=file.text("name"),
+            name=name,
             law=law,
             period=period or None,
             pd=gains,
-            horizon=file.integer("horizon") if predicts else 1,
+            horizon=horizon,
             position_weight=weights.number("position", above=0.0) if weighs else 1.0,
             velocity_weight=weights.number("velocity", 0.0, minimum=0.0),
             angle_weight=weights.number("angle", 0.0, minimum=0.0),

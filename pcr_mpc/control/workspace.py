@@ -31,7 +31,7 @@ class Workspace:
     """
 
     def __init__(self, tuning: Tuning, model: LinearModel) -> None:
-        self.n, self.dt = model.B.shape[1], model.dt
+        self.n, self.dt, self._reach = model.B.shape[1], model.dt, model.reach
         self._tuning = tuning
         rates = constraint_matrix(tuning.horizon, self.n)[: 2 * tuning.horizon * self.n].tocsc()
         self._rates_only = QPSolver(rates, tuning.tolerance, tuning.max_iterations)
@@ -44,7 +44,7 @@ class Workspace:
     def limited(self, kinds: tuple[str, ...]) -> LimitedQP:
         """Solver for limits of these kinds, made once."""
         if kinds not in self._limited:
-            self._limited[kinds] = LimitedQP(self._tuning, self.n, self.dt, kinds)
+            self._limited[kinds] = LimitedQP(self._tuning, self.n, self.dt, kinds, reach=self._reach)
         return self._limited[kinds]
 
     def reset(self) -> None:

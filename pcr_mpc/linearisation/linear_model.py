@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, overload
 
-import control
 import numpy as np
 
 from ..frozen import Frozen
@@ -42,8 +41,16 @@ class LinearModel(Frozen):
         """Predict the next state."""
         return np.asarray(self.A @ x + self.B @ u + self.c)
 
+    @property
+    def reach(self) -> float:
+        """How far the balanced tip moves at most when the motors turn [m/rad]: the length by which angles count."""
+        at_rest = np.linalg.lstsq(np.eye(4) - self.A[:4, :4], self.A[:4, 4:], rcond=None)[0]
+        return float(np.linalg.norm(at_rest[:2], 2))
+
     def to_control(self) -> Any:
         """Return the linear part as a `control.StateSpace` with the tip position as output."""
+        import control  # takes seconds, and nothing else needs it
+
         n_states, n_inputs = self.B.shape
         output = np.eye(2, n_states)
         return control.ss(self.A, self.B, output, np.zeros((2, n_inputs)), self.dt)
@@ -73,6 +80,10 @@ class LinearModels(Sequence[LinearModel]):
             return models
         parts = [[m.A.ravel("F"), m.c, m.B.ravel("F"), m.E.ravel("F")] for m in models]
         return cls(np.stack([np.concatenate(each) for each in parts], axis=1), models[0].dt, models[0].force)
+
+    def copy(self) -> LinearModels:
+        """The same, in memory of their own."""
+        return LinearModels(self.columns.copy(order="F"), self.dt, self.force.copy())
 
     @property
     def n(self) -> int:

@@ -53,7 +53,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     x = checked_vector("x", x, plant.n_states)
     checked_vector("u", u, plant.robot.n_rods)
     f_ext = checked_vector("f_ext", f_ext, 2)
-    dt = checked_number("dt", dt, minimum=1e-12)
+    dt = checked_number("dt", dt, above=0.0)
     force, k, g = plant.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
     inertia, slopes = plant.mass(x[:2], x[4:])
     mass, drag = plant.robot.tip_mass, plant.robot.drag

@@ -70,9 +70,11 @@ class LimitWatch(Remade):
         self._robot = robot = plant.robot
         if plant.method == "closed_form":
             self._plant, plain = plant, True
+            self._follows_model = True
         else:
             plain = plant.weight != "exact" and robot.weightless().needs_shooting is None
             self._plant = Plant(robot, weight="none") if plain else plant
+            self._follows_model = False
         if not plain:
             limits = replace(limits, rod_margin=None, stiffness=None)
         self.limits = limits
@@ -98,6 +100,33 @@ class LimitWatch(Remade):
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
         """Follow the branch of ``pose`` from state x."""
         self._plant.reset(x, pose)
+
+    @property
+    def follows_model(self) -> bool:
+        """Whether the plant that was given is the one that is asked, so that it may be told where its rods are."""
+        return self._follows_model
+
+    def far(self, signs: list[float]) -> bool:
+        """Whether no limit can be near a pose of rods in closed form, so that `rows` need not be asked.
+
+        ``signs`` are the least eigenvalue of K [N/m], torques [N m], and log tip angles and loads of the rods (see
+        `elastica`); NaN is not far.
+        """
+        limits, n = self.limits, (len(signs) - 1) // 3
+        if limits.tip_lower is not None:
+            return False
+        if limits.torque is not None and not max(map(abs, signs[1 : 1 + n])) < _TORQUE_WATCHED * limits.torque:
+            return False
+        if limits.stiffness is not None and not signs[0] > _STIFFNESS_WATCHED * limits.stiffness:
+            return False
+        if limits.rod_margin is None:
+            return True
+        near = (1.0 - limits.rod_margin - _MARGIN_WATCHED) * LEAST_CRITICAL_LOAD
+        return all(load <= near for load in signs[1 + 2 * n :])
+
+    def recall(self, record: np.ndarray) -> None:
+        """Tell the plant where its rods are (see `Plant.recall`)."""
+        self._plant.recall(record)
 
     def rows(self, x: np.ndarray) -> LinearLimits | None:
         """Limits that are near state x, following the branch; None if none is.

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..control.plan import Plan
+from ..errors import checked_period
 from ..frozen import read_only
 from ..plant.equilibrium import Equilibrium
 
@@ -24,11 +25,20 @@ class Decision:
         Certificate of the decision.
     linearise_time : float
         [s].
+    estimate : ndarray, shape (4 + n,), or None
+        Of the state at the measurement, which the decision rests on.
+    force : ndarray, shape (2,), or None
+        Unknown force on the tip, as estimated [N].
+    events : tuple of dict
+        What the run should tell of this period: ``kind`` and ``message`` of each.
     """
 
     u: np.ndarray
     plan: Plan | None = None
     linearise_time: float = 0.0
+    estimate: np.ndarray | None = None
+    force: np.ndarray | None = None
+    events: tuple[dict[str, str], ...] = ()
 
 
 class Controller(Protocol):
@@ -61,7 +71,9 @@ class Replay:
         """See `Controller`."""
 
     def step(self, k: int, x: np.ndarray) -> Decision:
-        """See `Controller`."""
+        """See `Controller`; ValueError beyond the last period."""
+        if not checked_period("k", k) < len(self._u):
+            raise ValueError(f"k = {k} is beyond the {len(self._u)} periods of this replay")
         return Decision(self._u[k])
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from .. import interrupt
 from ..control.qp import Reference
 from ..errors import ConvergenceError, PCRError
 from ..frozen import Frozen
@@ -13,12 +15,16 @@ from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import inverse_statics
 from ..plant.robot import Robot
+from ..plant.stability import least_rod_margin
 from .scene import Scene
+from .trajectory import sampled
 
 # The motor angles' change by the rods' inertia is found again from the angles that it leads to, until it settles [rad]:
 # each time the error falls as the rods' share of the mass, 1/200 of the change on the default robot.
 _SETTLED = 1e-5
 _MOST_SWEEPS = 20
+_STRIDE = 25  # periods from which to which the rods are followed along a reference that was solved before
+_SHARE_RESOLUTION = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,9 +40,21 @@ class InverseDynamics(Frozen, Reference):
         That the rods carry [N].
     angles_per_force : ndarray, shape (K, n, 2)
         Least change of the motor angles by which they carry one more newton [rad/N].
+    torques : ndarray, shape (K, n)
+        Of the motors [N m].
+    torques_per_force : ndarray, shape (K, n, 2)
+        Their change by that of the angles [N m/N].
+    stiffness : ndarray, shape (K,)
+        Least eigenvalue of K [N/m].
+    rod_margin : ndarray, shape (K,)
+        Least of the rods (see `least_rod_margin`).
     """
 
     angles_per_force: np.ndarray
+    torques: np.ndarray
+    torques_per_force: np.ndarray
+    stiffness: np.ndarray
+    rod_margin: np.ndarray
 
 
 def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, inertia: str = "none") -> InverseDynamics:
@@ -66,25 +84,29 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     Raises
     ------
     PCRError
-        The reference leaves the workspace; the message says when.
+        The reference leaves the workspace, or asks for more force than the rods can give; the message says when, and
+        of what acceleration to take how much less.
     ConvergenceError
         The inertia of the rods changes the angles too much for the fixed point.
     """
     assert scene.trajectory is not None
     t = scene.period * np.arange(scene.n_periods + horizon + 1)
-    p, v, a = np.moveaxis(scene.trajectory(t), 1, 0)
+    p, v, a = np.moveaxis(sampled(scene.trajectory, t), 1, 0)
     carried = scene.carried(t)
     # Mass and weight of what is carried, which has nothing to do with the rods.
     loads = carried[:, None] * (np.array(robot.gravity) - a)
     forces = loads - robot.tip_mass * a - robot.drag * v
-    q, levers = _angles(robot, pose, t, p, forces)
+    resting = carried[:, None] * np.array(robot.gravity)
+    poses = _poses(robot, pose, t, p, forces, resting, a)
+    q = np.stack([eq.q for eq in poses])
     if inertia != "none":
         plant = Plant(robot, inertia=inertia)
         for _ in range(_MOST_SWEEPS):
             plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
             momentum, push, own = _momentum(plant, carried, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
             forces = loads + push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
-            before, (q, levers) = q, _angles(robot, pose, t, p, forces)
+            poses = _poses(robot, pose, t, p, forces, resting, a)
+            before, q = q, np.stack([eq.q for eq in poses])
             change = float(np.abs(q - before).max())
             if change < _SETTLED:
                 break
@@ -99,23 +121,99 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
             )
         v = own
     rates = np.diff(q, axis=0) / scene.period
-    return InverseDynamics(np.hstack([p, v, q]), rates, forces, angles_per_force=levers)
+    return _inverse_dynamics(np.hstack([p, v, q]), rates, forces, poses)
 
 
-def _angles(
-    robot: Robot, pose: Equilibrium, t: np.ndarray, p: np.ndarray, forces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Motor angles at which the rods carry the forces at the tips p, (K, n) [rad], and their change by one more newton,
-    (K, n, 2) [rad/N]."""
-    angles, levers, eq = np.empty((len(t), robot.n_rods)), np.empty((len(t), robot.n_rods, 2)), pose
+def _inverse_dynamics(
+    states: np.ndarray, rates: np.ndarray, forces: np.ndarray, poses: list[Equilibrium]
+) -> InverseDynamics:
+    levers = np.stack([np.linalg.pinv(eq.dforce_dq) for eq in poses])
+    return InverseDynamics(
+        states,
+        rates,
+        forces,
+        angles_per_force=levers,
+        torques=np.stack([eq.motor_torque for eq in poses]),
+        torques_per_force=np.stack([eq.dtorque_dq for eq in poses])[:, :, None] * levers,
+        stiffness=np.array([eq.stiffness_eigenvalues[0] for eq in poses]),
+        rod_margin=np.array([least_rod_margin(eq) for eq in poses]),
+    )
+
+
+def held(
+    reference: InverseDynamics, k: int, robot: Robot, pose: Equilibrium, payload: float, count: int
+) -> InverseDynamics:
+    """The point of the reference in period k, held at rest for ``count`` periods.
+
+    Parameters
+    ----------
+    reference : InverseDynamics
+    k : int
+    robot : Robot
+        As it is believed to be.
+    pose : Equilibrium
+        At the start of the reference; its branch is followed.
+    payload : float
+        That the tip carries [kg].
+    count : int
+    """
+    on_the_way = np.unique([*range(0, k, _STRIDE), k])
+    p = reference.states[[*on_the_way, k], :2]
+    forces = np.vstack([reference.forces[on_the_way], payload * np.array(robot.gravity)])
+    end = _poses(robot, pose, np.full(len(p), np.nan), p, forces, forces, np.zeros_like(p))[-1]
+    state = np.concatenate([end.p, np.zeros(2), end.q])
+    states, forces = np.tile(state, (count + 1, 1)), np.tile(forces[-1], (count + 1, 1))
+    return _inverse_dynamics(states, np.zeros((count, robot.n_rods)), forces, [end] * (count + 1))
+
+
+def _poses(
+    robot: Robot,
+    pose: Equilibrium,
+    t: np.ndarray,
+    p: np.ndarray,
+    forces: np.ndarray,
+    resting: np.ndarray,
+    accelerations: np.ndarray,
+) -> list[Equilibrium]:
+    """Poses at which the rods carry the forces at the tips p; ``resting`` is what they would carry at rest [N]."""
+    poses, eq = [], pose
     for k in range(len(t)):
+        interrupt.check()
         try:
             eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
-            raise type(error)(f"reference at t = {t[k]:.3f} s: {error}", **error.details) from None
-        angles[k] = eq.q
-        levers[k] = np.linalg.pinv(eq.dforce_dq)
-    return angles, levers
+            fast = ""
+            if share := _share_of_motion(robot, eq, p[k], forces[k], resting[k]):
+                slower = math.ceil(10.0 / math.sqrt(share)) / 10.0
+                fast = (
+                    f"it asks for an acceleration of {math.hypot(*accelerations[k]):.3g} m/s^2, and the rods, which "
+                    f"could rest there, can give {100 * share:.0f} % of the force that its motion takes; smooth it, or "
+                    f"make it slower by a factor of at least {slower:g}: "
+                )
+            raise type(error)(f"reference at t = {t[k]:.3f} s: {fast}{error}", **error.details) from None
+        poses.append(eq)
+    return poses
+
+
+def _share_of_motion(
+    robot: Robot, before: Equilibrium, p: np.ndarray, force: np.ndarray, resting: np.ndarray
+) -> float | None:
+    """Share of ``force`` beyond ``resting`` that the rods can carry at p; None if they cannot even rest there."""
+
+    def possible(share: float) -> bool:
+        try:
+            inverse_statics(robot, p, resting + share * (force - resting), guess=before)
+        except PCRError:
+            return False
+        return True
+
+    if np.array_equal(force, resting) or not possible(0.0):
+        return None
+    low, high = 0.0, 1.0
+    while high - low > _SHARE_RESOLUTION:
+        middle = (low + high) / 2
+        low, high = (middle, high) if possible(middle) else (low, middle)
+    return low or high
 
 
 def _momentum(
@@ -125,6 +223,7 @@ def _momentum(
     n = 2 + plant.robot.n_rods
     momentum, push, own = (np.empty_like(p) for _ in range(3))
     for k in range(len(p)):
+        interrupt.check()
         mass, slopes = plant.mass(p[k], q[k])
         w = np.concatenate([v[k], rates[k]])
         momentum[k] = mass[:2] @ w

@@ -7,7 +7,11 @@ import json
 from dataclasses import fields, is_dataclass
 from typing import Any
 
+import numpy as np
+
+from ..plain import plain
 from .scene import Scene
+from .trajectory import Hold, Lemniscate, PickAndPlace, sampled
 
 
 def digest(scene: Scene) -> str:
@@ -16,19 +20,31 @@ def digest(scene: Scene) -> str:
     Not the controller's tuning, whose part in the motion is small, and nothing that has its default, so that a new
     property of robots does not make old findings void.
     """
-    kept = ("robot", "duration", "start_tip", "start_motors", "start_mode", "start_velocity", "trajectory", "plant",
+    kept = ("robot", "duration", "start_tip", "start_motors", "start_mode", "start_velocity", "plant",
             "period", "force", "delay", "payload", "need")  # fmt: skip
     facts = {name: _facts(getattr(scene, name)) for name in kept}
+    facts["trajectory"] = own_motion(scene) or _facts(scene.trajectory)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def own_motion(scene: Scene) -> dict[str, str] | None:
+    """Type and digest of the samples of a trajectory that is not the toolkit's; None: it says what it is itself."""
+    trajectory = scene.trajectory
+    if trajectory is None or isinstance(trajectory, Hold | Lemniscate | PickAndPlace):
+        return None
+    samples = sampled(trajectory, scene.period * np.arange(scene.n_periods + 1))
+    return {"type": type(trajectory).__name__, "samples": hashlib.sha256(samples.tobytes()).hexdigest()[:12]}
 
 
 def _facts(value: Any) -> Any:
     if is_dataclass(value):
-        given = {f.name: getattr(value, f.name) for f in fields(value) if getattr(value, f.name) != f.default}
+        given = {
+            f.name: getattr(value, f.name) for f in fields(value) if plain(getattr(value, f.name)) != plain(f.default)
+        }
         return {"type": type(value).__name__, **{name: _facts(each) for name, each in given.items()}}
-    if isinstance(value, tuple):
+    if isinstance(value, tuple | list | np.ndarray):
         return [_facts(each) for each in value]
-    return str(value) if isinstance(value, float) else value
+    return str(value) if isinstance(value, float) else plain(value)
 
 
 def verified(scene: Scene) -> bool:

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..buffered import BufferedFunction
+from ..compiled import fastest
 from ..errors import ConvergenceError, PCRError
+from ..linearisation.linear_model import LinearModels
 from ..linearisation.linearise import linearise
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
@@ -22,31 +24,32 @@ class Outlook:
 
     Attributes
     ----------
-    estimate : ndarray, shape (6 + n,)
-        State and force after the measurement.
     ahead : ndarray, shape (4 + n,)
         State when the decision reaches the motors.
     arriving : ndarray, shape (4 + n,)
         State at the end of the period; without a delay the one at its start.
-    models : ndarray, shape (size, 1 or N)
-        From there on, as columns (see `model_graph`).
+    now, models : LinearModels
+        For the period that begins now, length 1; from there on, length 1 or N.
     record : ndarray
         Of the rods there (see `warm_calls`).
     shift : ndarray, shape (n,)
         Added to the angles of the reference [rad].
     states : ndarray, shape (N, 4 + n)
         The reference with that.
+    signs : ndarray
+        See `LimitWatch.far`.
     qp : list of ndarray
         P, q, l, u, if wanted.
     """
 
-    estimate: np.ndarray
     ahead: np.ndarray
     arriving: np.ndarray
-    models: np.ndarray
+    now: LinearModels
+    models: LinearModels
     record: np.ndarray
     shift: np.ndarray
     states: np.ndarray
+    signs: np.ndarray
     qp: list[np.ndarray]
 
 
@@ -64,36 +67,48 @@ class Foresight:
         [s].
     condense : casadi.Function or None
         See `condensing`.
-    compiled : callable or None
-        Makes machine code of the graph.
+    compiled : bool
+        Whether to run as machine code where there is a compiler.
 
     Attributes
     ----------
     inputs : dict of str to ndarray
         Of the graph: what a caller writes before a call.
+    corrected : ndarray, shape (6 + n,)
+        State and force after the last measurement, also where the rods could not follow.
     """
 
     def __init__(
-        self, plant: Plant, target: Plant, places: Places, period: float, condense: Any | None, compiled: Any = None
+        self,
+        plant: Plant,
+        target: Plant,
+        places: Places,
+        period: float,
+        condense: Any | None,
+        *,
+        compiled: bool = False,
     ) -> None:
         assert plant.step_model is not None
         assert target.step_model is not None
-        self._plant, self._target_plant, self._places, self._period = plant, target, places, period
+        self._plant, self._target_plant, self.places, self._period = plant, target, places, period
         graph = foresight_graph(plant.step_model, target.step_model, places, condense)
-        self._graph = BufferedFunction(graph if compiled is None else compiled(graph))
+        self._graph = BufferedFunction(fastest(graph, compiled))
         self.inputs = dict(zip(graph.name_in(), self._graph.inputs, strict=True))
         self._outputs = dict(zip(graph.name_out(), self._graph.outputs, strict=True))
         self.inputs["dt"][:] = period
         self.inputs["target_numbers"][:] = target.numbers
         found, first = self._outputs, places.delay
+        columns, force = found["models"].reshape(-1, places.count, order="F"), found["corrected"][-2:]
+        self.corrected = found["corrected"]
         self._outlook = Outlook(
-            estimate=found["corrected"],
             ahead=_column(found["places"], first),
             arriving=found["arriving"],
-            models=found["models"].reshape(-1, places.count, order="F")[:, first:],
+            now=LinearModels(columns[:, :1], period, force),
+            models=LinearModels(columns[:, first:], period, force),
             record=_column(found["followed"], first),
             shift=found["moved_shift"],
             states=found["wanted"].reshape(-1, places.horizon, order="F").T,
+            signs=found["signs"],
             qp=[found[name] for name in ("P", "q", "l", "u") if name in found],
         )
 
@@ -107,6 +122,15 @@ class Foresight:
         self.inputs["shift"][:] = 0.0
         records = self.inputs["records"]
         records.reshape(len(self._plant.record), -1, order="F")[:] = self._plant.record[:, None]
+
+    def pose(self, x: np.ndarray) -> Equilibrium:
+        """Equilibrium at the state x at which the next period will begin, following the branch."""
+        self._plant.recall(_column(self.inputs["records"], 0))
+        return self._plant.equilibrium(x)
+
+    def target_from(self, other: Foresight) -> None:
+        """Go on with the motor target of another one of the same robot."""
+        self.inputs["target"][:], self.inputs["shift"][:] = other.inputs["target"], other.inputs["shift"]
 
     def __call__(self) -> Outlook:
         """Evaluate for the inputs, and keep the rods for the next period.
@@ -132,9 +156,9 @@ class Foresight:
         """Take the ladder for the rods that have not followed, one place after the other."""
         good, found = self._outputs["good"], self._outputs
         records = self.inputs["records"].reshape(len(self._plant.record), -1, order="F")
-        places = found["places"].reshape(-1, self._places.count, order="F")
+        places = found["places"].reshape(-1, self.places.count, order="F")
         payloads, force = self.inputs["payloads"].ravel(), found["corrected"][-2:]
-        for j in range(self._places.count):
+        for j in range(self.places.count):
             if good[j] < 1.0:
                 self._plant.recall(records[:, j])
                 x = places[:, j].copy()
@@ -155,7 +179,7 @@ class Foresight:
     def _follow_target(self) -> None:
         """Take the ladder for the rods of the motor target; where it leads nowhere, they stay where they are."""
         inputs, plant = self.inputs, self._target_plant
-        end = inputs["states"].reshape(-1, self._places.horizon, order="F")[:, -1]
+        end = inputs["states"].reshape(-1, self.places.horizon, order="F")[:, -1]
         plant.recall(inputs["target"])
         with suppress(PCRError):
             plant.force(end[:2], end[4:] + inputs["shift"])

@@ -14,6 +14,7 @@ from typing import Any
 
 import casadi as ca
 
+from ..control.observer import correction
 from ..linearisation.linearise import STIFFEST
 from ..linearisation.model_graph import force_graph, model_graph, sizes
 from ..plant.rod_follower import BRANCH_CHANGE
@@ -82,6 +83,7 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
         "records": ca.MX.sym("records", size.record, count),
         "target": ca.MX.sym("target", of_target.record),
         "shift": ca.MX.sym("shift", n),
+        "carries": ca.MX.sym("carries"),  # 1: the motor target carries the observed force, 0: it stays
         "numbers": ca.MX.sym("numbers", model.kind.size),
         "target_numbers": ca.MX.sym("target_numbers", target.kind.size),
         "mass": ca.MX.sym("mass", 2 + n, 2 + n),
@@ -93,7 +95,8 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
         "dt": ca.MX.sym("dt"),
     }
     given = SimpleNamespace(**inputs)
-    x, force = _corrected(given, n)
+    corrected = correction(n)(given.estimate, given.measured, given.gain, given.half_step)
+    x, force = corrected[:-2], corrected[-2:]
     found = [_place(model, given, x, force, 0, last=count == 1)]
     ahead = arriving = x
     for j in range(places.delay):
@@ -107,9 +110,9 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
     shift, target_record, target_good = _shifted(target, given, force, n)
     states = given.states + ca.vertcat(ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon))
     outputs = {
-        "good": ca.vertcat(good.T, target_good), "corrected": ca.vertcat(x, force), "arriving": arriving,
+        "good": ca.vertcat(good.T, target_good), "corrected": corrected, "arriving": arriving,
         "places": states_of,
-        "followed": records, "models": models, "moved_shift": shift, "followed_target": target_record, "wanted": states,
+        "followed": records, "models": models, "moved_shift": shift, "followed_target": target_record, "wanted": states, "signs": _signs(model, given, records[:, places.delay]),
     }  # fmt: skip
     if condense is not None:
         of_plan = models[:, places.delay :]
@@ -120,15 +123,6 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
             strict=True,
         )  # fmt: skip
     return ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
-
-
-def _corrected(given: Any, n: int) -> tuple[Any, Any]:
-    """State and force after the measurement (see `DisturbanceObserver.correct`)."""
-    x, force = given.estimate[: 4 + n], given.estimate[4 + n :]
-    change = given.gain @ (given.measured[:2] - x[:2])
-    least, most = given.measured[2:] - given.half_step, given.measured[2:] + given.half_step
-    angles = ca.fmin(ca.fmax(x[4:], least), most)
-    return ca.vertcat(x[:4] + change[:4], angles), force + change[4:]
 
 
 def _place(model: StepModel, given: Any, x: Any, force: Any, j: int, *, last: bool) -> tuple[Any, ...]:
@@ -170,5 +164,20 @@ def _shifted(target: StepModel, given: Any, force: Any, n: int) -> tuple[Any, An
     missing = given.end_force + force + numbers.tip_mass * numbers.gravity - found
     step = g.T @ ca.vertcat(d * missing[0] - b * missing[1], a * missing[1] - b * missing[0]) / determinant
     step = step * ca.fmin(1, _LARGEST_STEP / ca.fmax(ca.norm_inf(step), 1e-300))
-    moves = ca.logic_and(good, determinant >= _SINGULAR * a * d)
+    moves = ca.logic_and(given.carries, ca.logic_and(good, determinant >= _SINGULAR * a * d))
     return ca.if_else(moves, given.shift + step, given.shift), ca.if_else(good, record, given.target), good
+
+
+def _signs(model: StepModel, given: Any, record: Any) -> Any:
+    """By what limits of a pose come near: see `LimitWatch.far`."""
+    n, width = model.kind.n_rods, model.method.newton.size1_in(0)
+    ends = [0, width * n, (4 * width + 3) * n, (4 * width + 6) * n, (4 * width + 15) * n, record.size1()]
+    unknowns, _, loads, slopes, _ = ca.vertsplit(record, ends)
+    loads, slopes = ca.reshape(loads, 3, n), ca.reshape(slopes, 3, 3 * n)
+    torques, k = [], ca.MX(2, 2)
+    for i, rod in enumerate(model.kind.unpack(given.numbers).rods):
+        torques.append(-rod.bending_stiffness / rod.length * loads[2, i])
+        k += rod.bending_stiffness / rod.length**3 * slopes[:2, 3 * i : 3 * i + 2]
+    softest = (k[0, 0] + k[1, 1]) / 2 - ca.sqrt(((k[0, 0] - k[1, 1]) / 2) ** 2 + k[0, 1] ** 2)
+    shapes = ca.reshape(unknowns, width, n)[:2, :]
+    return ca.vertcat(softest, *torques, ca.vec(shapes.T))

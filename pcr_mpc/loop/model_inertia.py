@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from .. import interrupt
 from ..control.tuning import Tuning
 from ..errors import SimulationError
 from .run import Run
@@ -40,6 +41,7 @@ def by_model_inertia(
         try:
             found[inertia] = simulate(run.scene, plant, make_controller(run.scene, other), run.seed, progress=progress)
         except SimulationError as error:
+            interrupt.pass_on(error)
             found[inertia] = error.run
     summaries = {inertia: found[inertia].summary() for inertia in sorted(found, reverse=True)}
     return {inertia: {key: summary[key] for key in _FIGURES} for inertia, summary in summaries.items()}

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import math
+import zipfile
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import PCRError
-from ..frozen import Frozen
+from ..control.tuning import Tuning
+from ..errors import ModelError, PCRError
+from ..files import require_folder, results
+from ..frozen import Frozen, read_only
+from ..linearisation.linear_limits import KINDS
+from ..plain import plain
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
+from ..plant.robot import Robot
+from ..plant.stability import least_rod_margin
 from .finding import verified
+from .record import ARRAYS, FORMAT, from_text, record, write_csv
 from .scene import Scene
 from .settings import PlantSettings
 
 # Commands within this of a limit keep it: rounding for rates, the QP's tolerance for angles.
 _LIMIT_SLACK = 1e-9
 _ANGLE_SLACK = 1e-5
+# Of a limit on poses, relative to it: the controller keeps them to its solver's tolerance.
+_POSE_SLACK = 1e-3
+RECORD = ("run.npz", "run.csv", "summary.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +59,7 @@ class Run(Frozen):
     reference : ndarray, shape (K + 1, 2)
         Wanted tip positions [m]; NaN if there is nothing to track.
     u : ndarray, shape (M, n)
-        Commanded motor rates [rad/s].
+        Motor rates as decided [rad/s]: they reach the motors a delay later, see ``applied``.
     plant_time : ndarray, shape (K,)
         Wall time of each plant step [s].
     control_time : ndarray, shape (M, 6)
@@ -64,9 +74,26 @@ class Run(Frozen):
     rungs : dict
         How many poses of the plant each rung of the statics' ladder has solved (see `RodSolver`).
     events : list of dict
-        Fall-backs, missed deadlines, snaps and failures: time, kind, message.
+        Warnings, fall-backs, missed deadlines, measurements that were not believed, snaps and failures: time, kind,
+        message.
     rung : PlantSettings or None
         Physics and discretisation of the plant. None: it was another engine's.
+    measured : ndarray, shape (M, 4 + n)
+        States as the sensors gave them to the controller.
+    estimate : ndarray, shape (M, 4 + n)
+        States that the controller took for true; NaN where it did not say.
+    estimated_force : ndarray, shape (M, 2)
+        Unknown force on the tip as it was estimated [N]; NaN where it was not.
+    applied : ndarray, shape (K, n)
+        Motor rates that each plant step got [rad/s]; a motor at its stop does not follow them.
+    decision_time : ndarray, shape (M,)
+        Time that each decision is taken to have cost [s]: measured, or as ``spent`` of `simulate` says.
+    tuning : Tuning or None
+        Of the controller, where it has one.
+    believed : Robot or None
+        What the controller took the robot for, where it says so.
+    versions : dict
+        Of the toolkit and of what does its arithmetic.
     """
 
     scene: Scene
@@ -87,6 +114,14 @@ class Run(Frozen):
     rungs: dict[str, int]
     events: list[dict[str, Any]] = field(default_factory=list)
     rung: PlantSettings | None = None
+    measured: np.ndarray = field(kw_only=True)
+    estimate: np.ndarray = field(kw_only=True)
+    estimated_force: np.ndarray = field(kw_only=True)
+    applied: np.ndarray = field(kw_only=True)
+    decision_time: np.ndarray = field(kw_only=True)
+    tuning: Tuning | None = field(kw_only=True)
+    believed: Robot | None = field(kw_only=True)
+    versions: dict[str, str] = field(kw_only=True)
 
     @property
     def steps_per_period(self) -> int:
@@ -108,26 +143,87 @@ class Run(Frozen):
         lower, upper = robot.angle_limits.T
         broken = np.abs(self.u).max(axis=1, initial=0.0) > robot.rate_limit + _LIMIT_SLACK
         broken |= np.abs(change).max(axis=1, initial=0.0) > robot.acceleration_limit * period + _LIMIT_SLACK
-        outside = ((angles < lower - _ANGLE_SLACK) | (angles > upper + _ANGLE_SLACK)).any(axis=1)
-        broken[: len(outside)] |= outside
+        # Coming back from beyond a stop breaks nothing.
+        outside = (angles < lower - _ANGLE_SLACK) & (angles <= starts) | (angles > upper + _ANGLE_SLACK) & (
+            angles >= starts
+        )
+        broken[: len(outside)] |= outside.any(axis=1)
         return int(broken.sum())
 
     @cached_property
-    def peak_torque(self) -> float:
-        """Largest torque that a motor had to supply, by the exact rods at the control periods [N m].
+    def _poses(self) -> np.ndarray:
+        """Of the exact rods at the starts and ends of control periods: torques, least rod margin, least stiffness.
 
-        The MPC keeps the robot's torque limit where it can; this is what to hold against it. Up to where the rods were
-        lost, if they were: by a run that failed there, or by a snap.
+        NaN from where the rods were lost, if they were: by a run that failed there, or by a snap.
         """
-        plant = Plant(self.scene.robot, dt=self.dt)
+        plant, states = Plant(self.scene.robot, dt=self.dt), self.x[:: self.steps_per_period]
         plant.reset(self.x[0], self.pose)
-        largest = 0.0
-        for x in self.x[:: self.steps_per_period]:
+        found = np.full((len(states), self.scene.robot.n_rods + 2), np.nan)
+        for k, x in enumerate(states):
             try:
-                largest = max(largest, float(np.abs(plant.equilibrium(x).motor_torque).max()))
-            except PCRError:
+                eq = plant.equilibrium(x)
+            except (PCRError, ValueError):
                 break
-        return largest
+            found[k] = *eq.motor_torque, least_rod_margin(eq), eq.stiffness_eigenvalues[0]
+        return read_only(found)
+
+    @property
+    def torques(self) -> np.ndarray:
+        """Of the motors at the starts and ends of control periods, shape (M + 1, n) [N m]; NaN where rods were lost."""
+        return self._poses[:, :-2]
+
+    @property
+    def peak_torque(self) -> float:
+        """Largest torque that a motor had to supply, at the control periods, up to where the rods were lost [N m]."""
+        return float(np.abs(self.torques).max(initial=0.0, where=np.isfinite(self.torques)))
+
+    def pose_violations(self) -> dict[str, int]:
+        """Starts and ends of control periods at which the robot was beyond a limit on poses, for each kind of limit.
+
+        The controller keeps these limits where it can, and may leave the reference for it.
+        """
+        limits, tips = self.scene.pose_limits, self.x[:: self.steps_per_period, :2]
+        margins, stiffness = self._poses[:, -2:].T
+        given = dict(zip(KINDS, (True, limits.tip_lower, limits.rod_margin, limits.stiffness), strict=True))
+        broken = {"torque": (np.abs(self.torques) > (1 + _POSE_SLACK) * self.scene.torque_limit).any(axis=1)}
+        if limits.tip_lower is not None and limits.tip_upper is not None:
+            lower, upper = np.array(limits.tip_lower), np.array(limits.tip_upper)
+            slack = _POSE_SLACK * (upper - lower)
+            broken["tip region"] = ((tips < lower - slack) | (tips > upper + slack)).any(axis=1)
+        if limits.rod_margin is not None:
+            broken["rod margin"] = margins < limits.rod_margin - _POSE_SLACK
+        if limits.stiffness is not None:
+            broken["stiffness"] = stiffness < (1 - _POSE_SLACK) * limits.stiffness
+        return {kind: int(broken[kind].sum()) for kind, limit in given.items() if limit is not None}
+
+    def deadline_misses(self) -> int:
+        """Decisions that came after the scene's deadline, or took longer than the control period."""
+        return int((self.decision_time > min(self.scene.deadline, self.scene.period)).sum())
+
+    def verdict(self) -> str:
+        """Why the run is no good, in one line; empty if it is not known to be bad.
+
+        It ended early; or fewer than half of its decisions were solved as asked; or the tip left the reference by more
+        than the scene allows.
+        """
+        found = [f"failed at t = {event['t']:.4g} s: {event['message']}" for event in self.events
+                 if event["kind"] == "failure"]  # fmt: skip
+        return "; ".join(found + self._lost())
+
+    def _lost(self) -> list[str]:
+        """What makes a run that may have come to its end a failure."""
+        found = []
+        solved = len(self.u) - sum(event["kind"] == "fallback" for event in self.events)
+        if 2 * solved < len(self.u):
+            found.append(f"only {solved} of {len(self.u)} decisions were solved")
+        if np.isfinite(self.reference).all() and len(self.t):
+            worst = int(self.error.argmax())
+            if not self.error[worst] <= self.scene.allowed_error:  # so written that NaN is lost
+                found.append(
+                    f"tip lost: {1e3 * self.error[worst]:.1f} mm from the reference at t = {self.t[worst]:.3f} s, "
+                    f"allowed are {1e3 * self.scene.allowed_error:g} mm"
+                )
+        return found
 
     def _need(self) -> dict[str, Any] | None:
         """What the scene asks of the simulation, and what is known of that."""
@@ -163,10 +259,11 @@ class Run(Frozen):
         rungs = Counter(event["rung"] for event in self.events if event["kind"] == "fallback")
         return {
             "scene": self.scene.name,
+            "verdict": self.verdict(),
             "controller": self.controller,
             "plant": self.plant,
-            "rung": None if self.rung is None else asdict(self.rung),
-            "need": self._need(),
+            "rung": plain(self.rung),
+            "need": plain(self._need()),
             "seed": self.seed,
             "duration_s": float(self.t[-1]),
             "rms_mm": _rms(error_mm) if tracked else None,
@@ -189,7 +286,8 @@ class Run(Frozen):
                 "max": int(self.iterations.max(initial=0)),
             },
             "peak_torque_Nm": self.peak_torque,
-            "torque_limit_Nm": self.scene.robot.torque_limit,
+            "torque_limit_Nm": self.scene.torque_limit,
+            "pose_violations": self.pose_violations(),
             "statics_rungs": self.rungs,
             "limit_violations": self.limit_violations(),
             "control_steps": len(self.u),
@@ -197,35 +295,68 @@ class Run(Frozen):
             "slack": self.slack,
             "fallbacks": kinds.count("fallback"),
             "control_rungs": {"solved": len(self.u) - kinds.count("fallback"), **rungs},
-            "deadline_misses": kinds.count("late"),
+            "deadline_misses": self.deadline_misses(),
             "snaps": kinds.count("snap"),
-            "failures": kinds.count("failure"),
+            "warnings": kinds.count("warning"),
+            "refused_measurements": kinds.count("measurement"),
+            "failures": kinds.count("failure") or len(self._lost()),
             "events": self.events,
             "run_hash": self.hash(),
         }
 
-    def save(self, folder: str | Path) -> dict[str, str]:
-        """Write run.npz, run.csv and summary.json; return their paths by name."""
+    def save(self, folder: str | Path, *, force: bool = False) -> dict[str, str]:
+        """Write run.npz, run.csv and summary.json; return their paths by name.
+
+        They replace what an earlier run has left in the folder, its pictures too.
+
+        run.npz holds everything, for `load_run`; its ``about`` says as JSON what each array is, with units. run.csv has
+        a row for each plant step, with what the controller was given, took for true and decided (``u0_rad_s``) in the
+        control period that the step is in, what the motors got in the step (``u0_applied_rad_s``), and the torques at
+        the start of the period.
+
+        Raises
+        ------
+        OutputError
+            A file of this name was not written here, or was changed since, and ``force`` is not given.
+        """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        files = {name: str(folder / name) for name in ("run.npz", "run.csv", "summary.json")}
-        np.savez_compressed(
-            files["run.npz"], t=self.t, x=self.x, u=self.u, reference=self.reference, plant_time=self.plant_time,
-            control_time=self.control_time, iterations=self.iterations,
-            rung=json.dumps(self.rung and asdict(self.rung)), need=json.dumps(self._need()),
-        )  # fmt: skip
-        n = self.scene.robot.n_rods
-        per = self.steps_per_period
-        with open(files["run.csv"], "w", newline="", encoding="utf-8") as handle:
-            writer = csv.writer(handle)
-            writer.writerow(["t_s", "p_x_m", "p_y_m", "v_x_m_s", "v_y_m_s", *(f"q{i}_rad" for i in range(n)),
-                             "ref_x_m", "ref_y_m", *(f"u{i}_rad_s" for i in range(n))])  # fmt: skip
-            for k, (t, x, reference) in enumerate(zip(self.t, self.x, self.reference, strict=True)):
-                period = min(k // per, len(self.u) - 1)
-                rates = self.u[period] if len(self.u) else np.full(n, math.nan)
-                writer.writerow(f"{value:.9g}" for value in (t, *x, *reference, *rates))
-        Path(files["summary.json"]).write_text(json.dumps({**self.summary(), "files": files}, indent=2) + "\n")
+        files = {name: str(folder / name) for name in RECORD}
+        require_folder(folder, files, force=force)
+        with results(folder) as staged:
+            np.savez_compressed(staged / "run.npz", **record(self), need=json.dumps(plain(self._need())))
+            write_csv(self, staged / "run.csv")
+            text = json.dumps({**self.summary(), "files": files}, indent=2)
+            (staged / "summary.json").write_text(text + "\n", encoding="utf-8")
         return files
+
+
+def load_run(folder: str | Path) -> Run:
+    """Bring back a run from the folder that `Run.save` wrote it into, to the last bit.
+
+    A trajectory that is not one of the toolkit's comes back as samples at the plant's steps.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no run.npz in the folder.
+    ModelError
+        The file is no run, or one of another version of the toolkit.
+    """
+    path = Path(folder) / "run.npz"
+    try:
+        with open(path, "rb") as handle, np.load(handle) as stored:  # a file that is no archive is closed, too
+            if "format" not in stored or int(stored["format"]) != FORMAT:
+                found = int(stored["format"]) if "format" in stored else "none"
+                raise ModelError(
+                    f"{path}: format of the record is {found}, expected {FORMAT}; read its arrays with numpy.load, or "
+                    "load it with the version that wrote it",
+                    file=str(path),
+                )
+            return Run(**{name: stored[name] for name in ARRAYS}, **from_text(str(stored["record"])))
+    except (zipfile.BadZipFile, ValueError, KeyError, TypeError, EOFError) as error:
+        if isinstance(error, ModelError) and "file" in error.details:
+            raise
+        raise ModelError(f"{path}: no complete record of a run: {error}; run it again", file=str(path)) from error
 
 
 def percentiles(values: np.ndarray) -> dict[str, float | None]:

@@ -9,19 +9,20 @@ from pathlib import Path
 import numpy as np
 
 from ..control.tuning import Tuning, load_tuning
-from ..errors import ModelError
+from ..errors import ModelError, UnreachableError
 from ..linearisation.pose_limits import PoseLimits
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.free_tip import forward_statics, inverse_statics
 from ..plant.robot import Robot, load_robot
 from ..toml_table import Table, read_toml
+from .scene_checks import LATE, check_scene, is_multiple
 from .settings import Finding, Need, Payload, PlantSettings, read_finding, read_need, read_payload, read_plant
-from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
+from .trajectory import Trajectory, read_trajectory
 
-LATE = ("hold", "shifted_plan")
-# Distance of the start from the reference that is taken for the same place [m].
-_START_TOLERANCE = 1e-3
+# Distance of the start from the reference that is taken for the same place, in rod lengths: found, and as given.
+_START_TOLERANCE, _START_ROUNDING = 2.5e-3, 2.5e-9
+_LOST = 0.1  # of the shortest rod
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
 
@@ -73,6 +74,10 @@ class Scene:
         What is known of the plant's rung.
     own_period : float or None
         Control period of the scene [s], where its tuning asks for another.
+    wrapped : bool
+        Encoders tell angles in (-pi, pi] only.
+    tracking_error : float or None
+        Distance of the tip from the reference beyond which a run counts as lost [m]. None: a tenth of the shortest rod.
     """
 
     name: str
@@ -97,6 +102,31 @@ class Scene:
     need: Need | None = None
     finding: Finding | None = None
     own_period: float | None = None
+    wrapped: bool = False
+    tracking_error: float | None = None
+
+    @property
+    def allowed_error(self) -> float:
+        """Distance of the tip from the reference beyond which a run counts as lost [m]."""
+        if self.tracking_error is not None:
+            return self.tracking_error
+        return _LOST * float(self.robot.lengths.min())
+
+    def __post_init__(self) -> None:
+        check_scene(self)
+        if not is_multiple(self.period, self.plant.dt):
+            raise ModelError(
+                f"period is {self.period} s, not a multiple of the plant's step {self.plant.dt} s", key="period"
+            )
+        if self.duration < self.period:
+            raise ModelError(f"period is {self.period} s, longer than the duration {self.duration} s", key="period")
+        if not is_multiple(self.duration, self.period):
+            whole = math.floor(self.duration / self.period)
+            raise ModelError(
+                f"duration is {self.duration} s, which is no whole number of control periods of {self.period} s; "
+                f"take {whole * self.period:.10g} or {(whole + 1) * self.period:.10g} s",
+                key="duration",
+            )
 
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Payload at the times t [s], same shape [kg]."""
@@ -113,18 +143,22 @@ class Scene:
         Raises
         ------
         ModelError
-            That period is not a multiple of the plant's step.
+            That period is not a multiple of the plant's step, or the duration not one of it.
         """
         own = self.own_period or self.period
         period = tuning.period or own
-        ratio = period / self.plant.dt
-        if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio or self.duration < period:
+        if not (is_multiple(period, self.plant.dt) and is_multiple(self.duration, period)):
             raise ModelError(
                 f"{tuning.name}: period {period} s does not fit scene {self.name}: it must be a multiple of the "
-                f"plant's step {self.plant.dt} s and at most the duration {self.duration} s",
+                f"plant's step {self.plant.dt} s, and the duration {self.duration} s a multiple of it",
                 key="period",
             )
         return replace(self, tuning=tuning, period=period, own_period=own if tuning.period else None)
+
+    @property
+    def torque_limit(self) -> float:
+        """Of the motors, or of the poses if that is less [N m]."""
+        return min(self.robot.torque_limit, self.pose_limits.torque or math.inf)
 
     def start(self) -> Equilibrium:
         """Solve for the pose in which the robot starts, in balance without load.
@@ -132,13 +166,29 @@ class Scene:
         Raises
         ------
         ModelError
-            The free tip at ``start_motors`` is not where the reference begins.
+            The free tip at ``start_motors`` is not where the reference begins, these are beyond a stop, or to hold
+            the start takes more torque than the motors have.
         """
+        eq = self._start()
+        i = int(np.abs(eq.motor_torque).argmax())
+        torque = float(eq.motor_torque[i])
+        if abs(torque) > self.torque_limit:
+            raise ModelError(
+                f"{self.name}: to rest at the start, p = {eq.p} m, q = {eq.q} rad, takes {torque:.4g} N m of motor "
+                f"{i}, which has {self.torque_limit:.4g} N m; give the motors more torque, or start from another pose",
+                key="torque",
+                torque=torque,
+                limit=self.torque_limit,
+            )
+        return eq
+
+    def _start(self) -> Equilibrium:
         if self.start_motors is not None:
+            _require_within_stops(self)
             eq = forward_statics(self.robot, self.start_motors)
             if self.trajectory is not None:
                 begin = self.trajectory(np.zeros(1))[0, 0]
-                if np.hypot(*(begin - eq.p)) > _START_TOLERANCE:
+                if np.hypot(*(begin - eq.p)) > _START_TOLERANCE * self.robot.lengths.mean():
                     raise ModelError(
                         f"{self.name}: at start.motors the free tip rests at {eq.p} m (mode {eq.mode}), but "
                         f"the reference begins at {begin} m; start from that tip and a mode instead",
@@ -158,13 +208,16 @@ def load_scene(path: str | Path) -> Scene:
     Raises
     ------
     ModelError
-        A key is missing, misspelt, of the wrong type or out of range, in the scene or in its robot.
+        A key is missing, misspelt, of the wrong type or out of range, in the scene or in its robot; the motors start
+        beyond a stop; a rod is too short for the start or for the reference; or the scene's own limit on torque is too
+        low for the start. What else takes statics to see is seen at the start of a run, or by `check_scene`.
     """
     with read_toml(path) as file:
         name = file.text("name")
         robot = load_robot(file.path.parent / file.text("robot"))
         duration = file.number("duration", above=0.0)
         with file.table("limits", {}) as limits:
+            own_torque = limits.has("torque")
             robot = replace(
                 robot,
                 rate_limit=limits.number("rate", robot.rate_limit, above=0.0),
@@ -172,6 +225,7 @@ def load_scene(path: str | Path) -> Scene:
                 torque_limit=limits.number("torque", robot.torque_limit, above=0.0),
             )
             pose_limits = _pose_limits(limits, robot)
+            tracking_error = limits.number("tracking_error", 0.0, above=0.0) or None
         with file.table("world", {}) as world:
             robot = replace(robot, gravity=world.vector("gravity", 2, robot.gravity))
         with file.table("start") as start:
@@ -189,22 +243,19 @@ def load_scene(path: str | Path) -> Scene:
             delay = control.integer("delay", 0, minimum=0)
             deadline = control.number("deadline", math.inf, minimum=0.0)
             late = control.text("late", LATE[0], choices=LATE)
-            ratio = period / plant.dt
-            if duration < period:
-                raise control.fail("period", f"is {period} s, longer than the duration {duration} s")
-            if ratio < 0.5 or abs(ratio - round(ratio)) > 1e-9 * ratio:
-                raise control.fail("period", f"is {period} s, not a multiple of the plant's step {plant.dt} s")
         with file.table("load", {}) as load, file.table("sensor", {}) as sensor:
             force = load.vector("force", 2, (0.0, 0.0))
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
+            wrapped = sensor.boolean("wrapped", False)
         payload = read_payload(file)
         need, finding = read_need(file), read_finding(file)
         with file.table("reference") as reference:
-            trajectory = _trajectory(reference)
-    scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
-                  tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
-                  delay, deadline, late, pose_limits, payload, need, finding)  # fmt: skip
+            trajectory = read_trajectory(reference)
+        scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
+                      tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
+                      delay, deadline, late, pose_limits, payload, need, finding,
+                      wrapped=wrapped, tracking_error=tracking_error)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",
@@ -213,13 +264,50 @@ def load_scene(path: str | Path) -> Scene:
         )
     if tip is not None and trajectory is not None:
         begin = trajectory(np.zeros(1))[0, 0]
-        if np.hypot(*(begin - tip)) > 1e-9:
+        if np.hypot(*(begin - tip)) > _START_ROUNDING * robot.lengths.mean():
             raise ModelError(
                 f"{path}: start.tip {tip} is not where the reference begins, {tuple(begin.tolist())}",
                 file=str(path),
                 key="start.tip",
             )
+    try:
+        _require_within_stops(scene)
+        _require_reach(scene)
+        if own_torque:
+            scene.start()
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}", file=str(path), **error.details) from None
     return scene if scene.tuning is None else scene.tuned(scene.tuning)
+
+
+def _require_within_stops(scene: Scene) -> None:
+    for i, angle in enumerate(scene.start_motors or ()):
+        lower, upper = scene.robot.angle_limits[i]
+        if not lower <= angle <= upper:
+            raise ModelError(
+                f"{scene.name}: start.motors: motor {i} is to start at {angle:g} rad, beyond its stops, "
+                f"[{lower:g}, {upper:g}] rad; start within them",
+                key="start.motors",
+            )
+
+
+def _require_reach(scene: Scene) -> None:
+    """Raise if a rod is too short for the start or for the reference, which costs no statics to see."""
+    if scene.start_tip is not None:
+        try:
+            scene.robot.require_reachable(np.array(scene.start_tip))
+        except UnreachableError as error:
+            raise ModelError(f"{scene.name}: start.tip: {error}", key="start.tip", **error.details) from None
+    if scene.trajectory is None:
+        return
+    t = scene.period * np.arange(scene.n_periods + 1)
+    for at, tip in zip(t, scene.trajectory(t)[:, 0], strict=True):
+        try:
+            scene.robot.require_reachable(tip)
+        except UnreachableError as error:
+            raise ModelError(
+                f"{scene.name}: reference at t = {at:.3f} s: {error}", key="reference", t=float(at), **error.details
+            ) from None
 
 
 def _pose_limits(table: Table, robot: Robot) -> PoseLimits:
@@ -237,25 +325,3 @@ def _pose_limits(table: Table, robot: Robot) -> PoseLimits:
         table.number("rod_margin", _LEAST_ROD_MARGIN, minimum=0.0, maximum=0.9) or None,
         table.number("stiffness", softness, minimum=0.0) or None,
     )
-
-
-def _trajectory(table: Table) -> Trajectory | None:
-    kind = table.text("kind", choices=("none", "hold", "lemniscate", "pick_and_place"))
-    if kind == "hold":
-        return Hold(table.vector("position", 2))
-    if kind == "lemniscate":
-        return Lemniscate(
-            centre=table.vector("centre", 2),
-            size=table.vector("size", 2),
-            period=table.number("period", above=0.0),
-            ramp=table.number("ramp", above=0.0),
-        )
-    if kind == "pick_and_place":
-        return PickAndPlace(
-            pick=table.vector("pick", 2),
-            place=table.vector("place", 2),
-            lift=table.number("lift"),
-            wait=table.number("wait", minimum=0.0),
-            move=table.number("move", above=0.0),
-        )
-    return None

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import check_numbers
+from ..methods import METHODS
 from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
 from ..plant.inertia import INERTIAS
 from ..plant.robot import Robot
 from ..plant.rod import SCHEMES
-from ..plant.statics import METHODS, default_method
+from ..plant.statics import default_method
 from ..plant.weight import WEIGHTS
 from ..toml_table import Table
 
@@ -86,6 +88,9 @@ class Need:
     plant_step: float
     control_step: float
 
+    def __post_init__(self) -> None:
+        check_numbers(self, {key: {"above": 0.0} for key in ("tip_accuracy", "plant_step", "control_step")})
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -121,6 +126,10 @@ class Payload:
     mass: float
     pick: float
     place: float
+
+    def __post_init__(self) -> None:
+        check_numbers(self, {"mass": {"above": 0.0}, "pick": {"minimum": 0.0}})
+        check_numbers(self, {"place": {"above": self.pick}})
 
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Mass that the tip carries from the times t on [kg], same shape."""

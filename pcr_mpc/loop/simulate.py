@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -11,8 +12,15 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ..errors import SimulationError
+from .. import interrupt
+from ..control.tuning import Tuning
+from ..errors import SimulationError, checked_array, checked_integer, checked_vector
+from ..plant.robot import Robot
 from .controllers import Controller
+from .feasibility import reference_excess
+from .feed_forward import InverseDynamics
+from .foreign_parts import check_parts
+from .record import versions
 from .run import Run
 from .scene import Scene
 from .simulated_plant import SimulatedPlant
@@ -39,42 +47,62 @@ def simulate(
     seed : int
         Of the measurement noise.
     spent : callable, optional
-        (period, measured seconds) -> seconds that the decision is taken to have cost, where the scene has a deadline.
-        None: what was measured (then the run is not repeatable).
+        (period, measured seconds) -> seconds that the decision is taken to have cost, against the scene's deadline
+        and the control period. None: what was measured (then the run is not repeatable).
     progress : bool
-        Show a progress bar on stderr.
+        Show a progress bar on stderr, and before it what the reference asks for and the robot cannot do.
 
     Returns
     -------
     Run
+        Its events begin with what the reference asks for in vain, where the controller knows its inverse dynamics.
 
     Raises
     ------
+    ModelError
+        The start cannot be held (see `Scene.start`).
     SimulationError
-        The plant or the controller failed, or the run was interrupted; its ``run`` holds everything until
-        then, and its ``__cause__`` is the failure.
+        The plant or the controller failed, in whatever way, or the run was interrupted; its ``run`` holds everything
+        until then, and its ``__cause__`` is the failure.
+    ValueError
+        Before the start: names what plant or controller lack.
     """
+    check_parts(plant, controller, carries=scene.payload is not None)
+    seed = checked_integer("seed", seed, minimum=0)
     per = round(scene.period / plant.dt)
     if per < 1 or abs(per * plant.dt - scene.period) > 1e-9 * scene.period:
         raise ValueError(f"plant.dt = {plant.dt} s does not divide the control period {scene.period} s")
     pose = scene.start()
     x = np.concatenate([pose.p, scene.start_velocity, pose.q])
+    n_periods, n = scene.n_periods, scene.robot.n_rods
+    # Before the start, lest the record of a whole run fails for it.
+    wanted = _reference(scene, plant.dt * np.arange(n_periods * per + 1))
     plant.reset(x, pose)
     controller.start(pose)
+    interrupt.check()
     noise = np.random.default_rng(seed)
     # Rates, how many steps late they come, and what the plan foresaw for the period after.
     still = np.zeros(scene.robot.n_rods)
     on_the_way = deque([(still, 0, still)] * scene.delay)
-    n_periods, n = scene.n_periods, scene.robot.n_rods
 
     states = np.empty((n_periods * per + 1, len(x)))
     inputs = np.empty((n_periods, n))
     plant_time = np.empty(n_periods * per)
     control_time = np.zeros((n_periods, 6))
+    costs = np.zeros(n_periods)
+    measurements, estimates = np.empty((n_periods, len(x))), np.full((n_periods, len(x)), np.nan)
+    forces, applied = np.full((n_periods, 2), np.nan), np.empty((n_periods * per, n))
     iterations = np.zeros(n_periods, dtype=int)
     active: Counter[str] = Counter()
     slack: dict[str, float] = {}
     events: list[dict[str, Any]] = []
+    # What only some controllers know of themselves.
+    asked, tuning, believed = (getattr(controller, name, None) for name in ("reference", "tuning", "robot"))
+    if isinstance(asked, InverseDynamics):
+        for line in reference_excess(scene, asked):
+            events.append({"t": 0.0, "kind": "warning", "message": line})
+            if progress:
+                print(f"{scene.name}: warning: {line}", file=sys.stderr)
     states[0] = x
     done, decided, snapped = 0, 0, 0
     meanwhile = np.zeros(n)
@@ -84,7 +112,6 @@ def simulate(
 
     def record() -> Run:
         t = plant.dt * np.arange(done + 1)
-        reference = np.full((done + 1, 2), np.nan) if scene.trajectory is None else scene.trajectory(t)[:, 0]
         return Run(
             scene=scene,
             controller=controller.name,
@@ -94,7 +121,7 @@ def simulate(
             dt=plant.dt,
             t=t,
             x=states[: done + 1].copy(),
-            reference=reference,
+            reference=wanted[: done + 1].copy(),
             u=inputs[:decided].copy(),
             plant_time=plant_time[:done].copy(),
             control_time=control_time[:decided].copy(),
@@ -104,22 +131,41 @@ def simulate(
             rungs=plant.rungs,
             events=events,
             rung=scene.plant if scene.plant.describes(plant, scene.robot) else None,
+            measured=measurements[:decided].copy(),
+            estimate=estimates[:decided].copy(),
+            estimated_force=forces[:decided].copy(),
+            applied=applied[:done].copy(),
+            decision_time=costs[:decided].copy(),
+            tuning=tuning if isinstance(tuning, Tuning) else None,
+            believed=believed if isinstance(believed, Robot) else None,
+            versions=versions(),
         )
 
     try:
         for k in tqdm(range(n_periods), desc=scene.name, unit="period", disable=not progress):
+            interrupt.check()
             measured = x.copy()
             if scene.tip_noise:
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
             if scene.angle_step:
                 measured[4:] = scene.angle_step * np.round(measured[4:] / scene.angle_step)
+            if scene.wrapped:
+                measured[4:] -= 2 * np.pi * np.ceil(measured[4:] / (2 * np.pi) - 0.5)
+            measurements[k] = measured
             began, began_cpu = time.perf_counter(), time.thread_time()
             decision = controller.step(k, measured)
             control_time[k, 0] = time.perf_counter() - began
             control_time[k, 5] = time.thread_time() - began_cpu
-            inputs[k] = decision.u
-            decided = k + 1
+            # Named here: NumPy would spread one number over all motors.
+            inputs[k] = checked_vector("the controller's u", decision.u, n)
+            if decision.estimate is not None:
+                estimates[k] = decision.estimate
+            if decision.force is not None:
+                forces[k] = decision.force
             cost = float(control_time[k, 0]) if spent is None else spent(k, float(control_time[k, 0]))
+            costs[k] = cost
+            decided = k + 1
+            events += [{"t": k * scene.period, **event} for event in decision.events]
             late = 0
             if cost > scene.deadline:
                 late = min(per, math.ceil(cost / plant.dt))
@@ -146,9 +192,11 @@ def simulate(
             on_the_way.append((decision.u, late, after))
             arrived, waiting, after = on_the_way.popleft()
             for j in range(per):
+                interrupt.check()
                 u = meanwhile if j < waiting else arrived
                 if done in changes:
                     x = plant.carry(float(payloads[done]), x)
+                applied[done] = u
                 began = time.perf_counter()
                 x = plant.step(x, u, scene.force)
                 plant_time[done] = time.perf_counter() - began
@@ -165,7 +213,7 @@ def simulate(
                     )
                 snapped = len(plant.snaps)
             meanwhile = after
-    except (Exception, KeyboardInterrupt) as error:  # whatever it is, the run so far is kept
+    except BaseException as error:  # whatever it is, a foreign controller's sys.exit() too, the run so far is kept
         what = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
         t = done * plant.dt
         events.append({"t": t, "kind": "failure", "message": what})
@@ -173,3 +221,10 @@ def simulate(
             f"{scene.name} stopped at t = {t:.4f} s of {scene.duration} s: {what}", run=record(), t=t
         ) from error
     return record()
+
+
+def _reference(scene: Scene, t: np.ndarray) -> np.ndarray:
+    """Wanted tip positions at the times t, shape (len(t), 2) [m]; NaN if there is nothing to track."""
+    if scene.trajectory is None:
+        return np.full((len(t), 2), np.nan)
+    return checked_array("what the scene's trajectory returns", scene.trajectory(t), (len(t), 3, 2))[:, 0]

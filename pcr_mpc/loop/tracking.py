@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from ..control.mpc import LinearMPC
 from ..control.nonlinear_mpc import NonlinearMPC
 from ..control.observer import DisturbanceObserver
 from ..control.plan import Plan
-from ..control.qp import Reference
+from ..control.qp import QuadraticProgram, Reference, constraint_matrix, motor_bounds, stage_weights
 from ..control.tuning import Limits, Tuning
-from ..errors import PCRError
+from ..errors import PCRError, checked_period, measured_vector
 from ..frozen import Remade, set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
@@ -26,9 +26,11 @@ from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
 from ..plant.robot import Robot
 from ..plant.symbolic import rod_unknowns, symbolic_dynamics
-from .along_plan import AlongPlan
 from .controllers import Controller, Decision, HoldMotors
-from .feed_forward import InverseDynamics, feed_forward
+from .feed_forward import InverseDynamics, feed_forward, held
+from .foresight import Foresight, Outlook
+from .foresight_graph import Places
+from .gate import Gate
 from .scene import Scene
 from .target import MotorTarget
 
@@ -65,20 +67,26 @@ class TrackingController(Remade):
         needed = scene.n_periods + tuning.horizon + self._delay
         if reference is not None and len(reference.inputs) < needed:
             raise ValueError(f"reference has {len(reference.inputs)} periods; scene and horizon need {needed}")
-        self._model = self._make_model()
-        self._along = self._make_along()
-        self._watch = LimitWatch(scene.pose_limits, self._model)
-        self._target = MotorTarget(self.robot)
+        self._foresight: Foresight | None = None
+        self._watch = LimitWatch(scene.pose_limits, self._make_model())
+        self._limits = motor_limits(scene.robot, scene.period)
+        self._gate = self._make_gate()
         self._sent: deque[np.ndarray] = deque(maxlen=scene.delay)
         self._on_the_way: deque[np.ndarray] = deque()
         self._u = np.zeros(self.robot.n_rods)
         self._plan: Plan | None = None
         self._inverse = MotorTarget(self.robot)
         self._law: Law | None = None
+        self._end: InverseDynamics | None = None  # the last point of the reference, once it is held
+
+    @property
+    def reference(self) -> InverseDynamics:
+        """Inverse dynamics of the scene's reference, from `start` on."""
+        return self._reference
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
-        self._pose = pose
+        self._pose, self._end = pose, None
         self._invert_dynamics(self._known)
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         if self._law is None:
@@ -97,12 +105,14 @@ class TrackingController(Remade):
         self.observer = self._make_observer(resting)
         if self.observer is not None:
             self.observer.start(x)
-        for part in (self._model, self._watch, self._along):
-            if part is not None:
-                part.reset(x, pose)
-        self._target.start(pose)
+        if self._foresight is None:
+            self._foresight = self._make_foresight()
+        self._set_out(x, pose)
+        self._watch.reset(x, pose)
         self._inverse.start(pose)
-        self._predicts, self._seen = resting, (x, np.zeros(self.robot.n_rods))
+        self._gate.start(pose.q)
+        self._reckoned = pose.q  # where the commands so far lead, whatever is measured
+        self._predicts, self._next = resting, x
         self._sent.extend([np.zeros(self.robot.n_rods)] * self._told.delay)
         self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
         self._u = np.zeros(self.robot.n_rods)
@@ -141,21 +151,12 @@ class TrackingController(Remade):
         self._take(tuning)
         self._known = None
         model_changed = tuning.model != old.model
-        started = self._law is not None
-        here = self._expected() if started else np.zeros(0)
         if model_changed:
-            pose = self._model.equilibrium(here) if started else None
-            self._model = self._make_model()
-            self._watch = LimitWatch(self._told.pose_limits, self._model)
-            if pose is not None:
-                self._model.reset(here, pose)
-                self._watch.reset(here, pose)
-        if model_changed or tuning.horizon != old.horizon:
-            self._along = self._make_along()
-            if self._along is not None and started:
-                self._along.reset(here, self._model.equilibrium(here))
-        if not started:
+            self._watch = LimitWatch(self._told.pose_limits, self._make_model())
+        if self._law is None or self._foresight is None:
+            self._foresight = None
             return
+        here, last = self._expected(), self._foresight
         needed = self._scene.n_periods + tuning.horizon + self._delay
         same_dynamics = (tuning.model.inertia, self._scene) == (old.model.inertia, scene)
         if not same_dynamics or len(self._reference.inputs) < needed:
@@ -169,93 +170,173 @@ class TrackingController(Remade):
                     self.observer.force = observer.force.copy()
         if self._delay != len(self._on_the_way):
             self._on_the_way = deque(list(self._sent)[len(self._sent) - self._delay :])
-        assert self._law is not None
         if tuning.law == old.law and not model_changed:
             self._law.retune(tuning)
         else:
             self._law = self._make_law(self._pose)
             self._law.prepare(resting, self._watch.combinations())
+        pose = last.pose(here)
+        self._foresight = self._make_foresight()
+        self._set_out(here, pose)
+        self._foresight.target_from(last)
+        if model_changed:
+            self._watch.reset(here, pose)
 
-    def step(self, k: int, x: np.ndarray) -> Decision:
-        """See `Controller`; a measurement that is not finite is bridged by the prediction."""
-        observer = self.observer
-        force = np.zeros(2)
-        if observer is not None:
-            if all(map(math.isfinite, x[:2].tolist() + x[4:].tolist())):
-                observer.correct(x[:2], x[4:])
-            x, force = observer.x, observer.force
+    def step(self, k: int, x: Any) -> Decision:
+        """See `Controller`; what cannot have been measured is bridged by the prediction, and told in an event.
+
+        Parameters
+        ----------
+        k : int
+            Control period; beyond the end of the scene the last point of the reference is held.
+        x : array_like, shape (4 + n,)
+            Measured state [m, m/s, rad]; what is missing is NaN. With an observer the velocity is not looked at.
+
+        Raises
+        ------
+        PCRError
+            The controller was not started.
+        MeasurementError
+            The first measurement is in other units, or its angles are wrapped.
+        ValueError
+            Names the argument: x has another shape, or k is no period.
+        """
+        if self._law is None or self._foresight is None:
+            raise PCRError(f"controller {self.name} was not started: call start(pose) before the first step")
+        k, x = checked_period("k", k), measured_vector("x", x, 4 + self.robot.n_rods)
         began = time.perf_counter()
-        failure, now, ahead = "", None, x
-        models: LinearModel | list[LinearModel] | None = None
-        pose_limits: LinearLimits | None = None
+        foresight, observer, now = self._foresight, self.observer, self._expected()
+        found = self._gate.sift(k, x, now, observer is None)
+        if observer is None:
+            velocity = x[2:4] if found.velocity is None else found.velocity
+            now = np.concatenate([now[:4] if found.p is None else np.concatenate([found.p, velocity]), now[4:]])
+            if found.q is not None:
+                now[4:] = found.q
+        elif found.p is not None and found.velocity is not None:
+            observer.move(found.p, found.velocity)
+            now = observer.x
+        self._tell(k, now, found.p, found.q)
+        failure, pose_limits, outlook = "", None, None
         try:
-            for j, u in enumerate(self._on_the_way):
-                model = self._model_at(k + j, ahead, u, force)
-                now = now or model
-                ahead = model(ahead, u)
-            models = self._linearise(ahead, k, force)
-            pose_limits = self._watch.rows(ahead)
+            outlook = foresight()
+            if not (self._watch.follows_model and self._watch.far(outlook.signs.tolist())):
+                pose_limits = self._near(outlook)
         except (PCRError, ValueError) as error:
             if self.tuning.fallback == "raise":
                 raise
-            failure, models = f"no linear model: {error}", None
-        linearised = time.perf_counter() - began
-        window = self._window(k + self._delay, force)
-        assert self._law is not None
-        if models is None:
-            plan = self._law.fall_back(failure, ahead, window, self._u)
-        else:
-            plan = self._law.solve(ahead, models, window, self._u, pose_limits)
+            failure, outlook = f"no linear model: {error}", None
+        corrected = foresight.corrected
+        if observer is not None:
+            observer.take(corrected)
+        estimate, force = corrected[:-2].copy(), corrected[-2:].copy()
+        linearised = time.perf_counter()
+        plan, ahead = self._decide(k, outlook, pose_limits, estimate, force, failure, linearised)
+        plan = self._within_stops(plan, ahead)
         self._u, self._plan = plan.inputs[0], plan
+        self._reckoned = self._reckoned + self._scene.period * self._u
         self._sent.append(self._u)
         self._on_the_way.append(self._u)
         arriving = self._on_the_way.popleft()
-        if now is not None:
-            self._predicts = now
-        elif models is not None:
-            # A plan may know better than the models that it was asked for with.
-            better = models if plan.models is None or plan.fallback else plan.models
-            self._predicts = better if isinstance(better, LinearModel) else better[0]
-        if observer is not None:
-            observer.predict(self._predicts, arriving)
-        self._seen = x, arriving
-        return Decision(plan.inputs[0], plan, linearised)
+        self._look_on(outlook, plan, estimate, arriving)
+        return Decision(plan.inputs[0], plan, linearised - began, estimate, force, found.events)
 
-    def _linearise(self, x: np.ndarray, k: int, force: np.ndarray) -> LinearModel | list[LinearModel]:
-        here = self._model_at(k + self._delay, x, self._u, force)
-        if self._along is None:
-            return here
-        first = k + self._delay + 1
-        # The last plan, one period on; at the start, and beyond the end of a shorter plan, the reference.
-        path = self._reference.states[first : first + self.tuning.horizon - 1]
-        if self._plan is not None and self._plan.states is not None:
-            known = self._plan.states[2:]
-            path = known if len(known) == len(path) else np.concatenate([known[: len(path)], path[len(known) :]])
-        return [here, *self._along.models(path, self._u, force, self._payloads[first : first + len(path)])]
+    def _tell(self, k: int, now: np.ndarray, p: np.ndarray | None, q: np.ndarray | None) -> None:
+        """Write what is known in period k into the graph that looks ahead."""
+        assert self._foresight is not None
+        given, horizon, observer = self._foresight.inputs, self.tuning.horizon, self.observer
+        given["estimate"][:-2] = now
+        given["estimate"][-2:] = 0.0 if observer is None else observer.force
+        given["measured"][:2] = now[:2] if p is None else p
+        given["measured"][2:] = now[4:] if q is None else q
+        for j, u in enumerate(self._on_the_way):
+            given["on_the_way"].reshape(len(u), -1, order="F")[:, j] = u
+        given["u_previous"][:] = self._u
+        reference, row = self._rows(k, k + self._delay)
+        given["states"][:] = _columns(reference.states[row + 1 : row + 1 + horizon], given["states"])
+        given["inputs"][:] = _columns(reference.inputs[row : row + horizon], given["inputs"])
+        given["end_force"][:] = reference.forces[row + horizon]
+        count = self._foresight.places.count
+        given["payloads"].ravel()[:] = self._payloads[np.minimum(np.arange(k, k + count), len(self._payloads) - 1)]
+        if self._foresight.places.models > 1:
+            # The last plan, one period on; at the start, and beyond the end of a shorter plan, the reference.
+            reference, row = self._rows(k, k + self._delay + 1)
+            path = reference.states[row : row + horizon - 1]
+            if self._plan is not None and self._plan.states is not None:
+                known = self._plan.states[2:]
+                path = known if len(known) == len(path) else np.concatenate([known[: len(path)], path[len(known) :]])
+            given["path"][:] = _columns(path, given["path"])
 
-    def _model_at(self, k: int, x: np.ndarray, u: np.ndarray, force: np.ndarray) -> LinearModel:
-        """Linear model about x, with what the tip carries in period k."""
-        payload = float(self._payloads[k])
-        if payload != self._model.payload:
-            self._model.carry(payload, x)
-        return linearise(self._model, x, u, self._scene.period, force)
+    def _near(self, outlook: Outlook) -> LinearLimits | None:
+        """Limits of the pose ahead that are near."""
+        if self._watch.follows_model:
+            self._watch.recall(outlook.record)
+        return self._watch.rows(outlook.ahead.copy())
 
-    def _window(self, k: int, force: np.ndarray) -> Reference:
-        """Reference over the horizon from period k on, its angles moved to carry the unknown force."""
-        horizon, reference = self.tuning.horizon, self._reference
-        states, inputs = reference.states[k + 1 : k + 1 + horizon], reference.inputs[k : k + horizon]
-        forces = reference.forces[k + 1 : k + 1 + horizon]
+    def _decide(
+        self,
+        k: int,
+        outlook: Outlook | None,
+        pose_limits: LinearLimits | None,
+        estimate: np.ndarray,
+        force: np.ndarray,
+        failure: str,
+        began: float,
+    ) -> tuple[Plan, np.ndarray]:
+        """The law's plan, and the state from which it starts."""
+        assert self._law is not None
+        assert self._foresight is not None
+        horizon = self.tuning.horizon
+        reference, row = self._rows(k, k + self._delay)
+        inputs, forces = reference.inputs[row : row + horizon], reference.forces[row + 1 : row + 1 + horizon]
+        if outlook is None:
+            states = reference.states[row + 1 : row + 1 + horizon].copy()
+            states[:, 4:] += self._foresight.inputs["shift"]
+            return self._law.fall_back(failure, estimate, Reference(states, inputs, forces + force), self._u), estimate
+        window, ahead = Reference(outlook.states, inputs, forces + force), outlook.ahead.copy()
+        if isinstance(self._law, LinearMPC):
+            p, q, lower, upper = outlook.qp
+            qp = QuadraticProgram(p, q, constraint_matrix(horizon, self.robot.n_rods), lower, upper)
+            models = outlook.models.copy()
+            return self._law.decide(qp, ahead, models, window, self._u, pose_limits, began), ahead
+        return self._law.solve(ahead, outlook.models.copy(), window, self._u, pose_limits), ahead
+
+    def _look_on(self, outlook: Outlook | None, plan: Plan, estimate: np.ndarray, arriving: np.ndarray) -> None:
+        """Foresee the state at the next measurement."""
+        if outlook is not None and self._delay:
+            expected = outlook.arriving.copy()
+            self._predicts = outlook.now[0]
+        else:
+            if outlook is not None:
+                # A plan may know better than the models that it was asked for with.
+                better = outlook.models if plan.models is None or plan.fallback else plan.models
+                self._predicts = better if isinstance(better, LinearModel) else better[0]
+            expected = self._predicts(estimate, arriving)
+        self._next = expected
         if self.observer is not None:
-            end, lever = states[-1], self._reference.angles_per_force[k + horizon]
-            forces = forces + force
-            shift = self._target.small_shift(end[:2], end[4:], lever, force)
-            states = states.copy()
-            states[:, 4:] += self._target.shift(end[:2], end[4:], forces[-1]) if shift is None else shift
-        return Reference(states, inputs, forces)
+            self.observer.x = expected
+
+    def _within_stops(self, plan: Plan, ahead: np.ndarray) -> Plan:
+        """The plan, its first rates within the stops for the sum of the commands too: a wrong angle may be measured."""
+        first = plan.inputs[0]
+        kept = self._limits.kept(first, self._u, ahead[4:], self._scene.period, self._reckoned)
+        if kept.tolist() == first.tolist():
+            return plan
+        active = plan.active if "angle" in plan.active else (*plan.active, "angle")
+        return replace(plan, inputs=np.vstack([kept, plan.inputs[1:]]), active=active)
+
+    def _rows(self, k: int, row: int) -> tuple[InverseDynamics, int]:
+        """Where to read the reference's ``row`` in period k: beyond the scene's end its last point is held."""
+        last = self._scene.n_periods
+        if k < last:
+            return self._reference, row
+        if self._end is None:
+            payload = float(self._payloads[-1])
+            self._end = held(self._reference, last, self.robot, self._pose, payload, self.tuning.horizon)
+        return self._end, 0
 
     def _expected(self) -> np.ndarray:
         """State that is expected at the next step."""
-        return self._predicts(*self._seen) if self.observer is None else self.observer.x
+        return self._next if self.observer is None else self.observer.x
 
     def _take(self, tuning: Tuning) -> None:
         self.__dict__["tuning"], self.name = tuning, tuning.name
@@ -275,10 +356,33 @@ class TrackingController(Remade):
         self._resting = linearise(model, x, np.zeros(self.robot.n_rods), self._scene.period)
         return self._resting
 
-    def _make_along(self) -> AlongPlan | None:
-        if self.tuning.model.linearise != "along_plan":
-            return None
-        return AlongPlan([self._make_model() for _ in range(self.tuning.horizon - 1)], self._scene.period)
+    def _make_foresight(self) -> Foresight:
+        """Graph of the model, the law's QP included, with everything in it that does not change from step to step."""
+        tuning, law = self.tuning, self._law
+        models = tuning.horizon if tuning.model.linearise == "along_plan" else 1
+        places = Places(self._delay, models, tuning.horizon)
+        condense = law.condensing(self.robot.n_rods, models) if isinstance(law, LinearMPC) else None
+        return Foresight(
+            self._make_model(), Plant(self.robot), places, self._scene.period, condense, compiled=tuning.model.compiled
+        )
+
+    def _set_out(self, x: np.ndarray, pose: Equilibrium) -> None:
+        """Let the foresight begin at state x on the branch of ``pose``, with what does not change from step to step."""
+        assert self._foresight is not None
+        self._foresight.reset(x, pose)
+        given = self._foresight.inputs
+        if isinstance(self._law, LinearMPC):
+            given["weights"][:] = stage_weights(self.tuning)
+            given["bounds"][:] = motor_bounds(self._limits)
+            given["terminal"][:] = self._law.terminal
+        if self.observer is not None:
+            given["gain"][:], given["half_step"][:] = self.observer.gain, self.observer.half_step
+        given["carries"][:] = self.observer is not None
+
+    def _make_gate(self) -> Gate:
+        scene, observer = self._told, self.tuning.observer
+        noise = max(scene.tip_noise, observer.tip_noise if observer else 0.0)
+        return Gate(self.robot, self._limits, scene.period, noise, scene.angle_step, scene.wrapped)
 
     def _make_observer(self, resting: LinearModel) -> DisturbanceObserver | None:
         if self.tuning.observer is None:
@@ -293,7 +397,7 @@ class TrackingController(Remade):
         )  # fmt: skip
 
     def _make_law(self, pose: Equilibrium) -> Law:
-        tuning, limits = self.tuning, motor_limits(self._scene.robot, self._scene.period)
+        tuning, limits = self.tuning, self._limits
         if tuning.law == "linear_mpc":
             return LinearMPC(tuning, limits)
         if tuning.law == "nonlinear_mpc":
@@ -306,6 +410,11 @@ class TrackingController(Remade):
         if tuning.law == "pd":
             return PD(tuning, limits, lambda p, q, force: q + self._inverse.shift(p, q, force))
         return FeedForward(tuning, limits)
+
+
+def _columns(rows: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Rows as the columns of a graph's input."""
+    return rows.T.reshape(like.shape, order="F")
 
 
 def motor_limits(robot: Robot, period: float) -> Limits:

@@ -7,12 +7,28 @@ from typing import Protocol
 
 import numpy as np
 
+from ..errors import ModelError, check_numbers, checked_array, checked_vector
+from ..toml_table import Table
+
+_POSITIVE = {"above": 0.0}
+
 
 class Trajectory(Protocol):
     """A path of the tip in time."""
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """Position [m], velocity [m/s] and acceleration [m/s^2] at times t, shape (len(t), 3, 2)."""
+
+
+def sampled(trajectory: Trajectory, t: np.ndarray) -> np.ndarray:
+    """Position, velocity and acceleration at times t [s], shape (len(t), 3, 2), of a trajectory that may be anybody's.
+
+    Raises
+    ------
+    ValueError
+        It returned something else, or numbers that are not finite.
+    """
+    return checked_array(f"what the trajectory {type(trajectory).__name__} returned", trajectory(t), (len(t), 3, 2))
 
 
 def smooth_step(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -29,6 +45,9 @@ class Hold:
     """Stay at a point."""
 
     position: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        _check_points(self, "position")
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """See `Trajectory`."""
@@ -60,6 +79,10 @@ class Lemniscate:
     size: tuple[float, float]
     period: float
     ramp: float
+
+    def __post_init__(self) -> None:
+        _check_points(self, "centre", "size")
+        check_numbers(self, {"period": _POSITIVE, "ramp": _POSITIVE})
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """See `Trajectory`."""
@@ -102,6 +125,10 @@ class PickAndPlace:
     wait: float
     move: float
 
+    def __post_init__(self) -> None:
+        _check_points(self, "pick", "place")
+        check_numbers(self, {"lift": {}, "wait": {"minimum": 0.0}, "move": _POSITIVE})
+
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """See `Trajectory`."""
         s, slope, curvature = smooth_step((t - self.wait) / self.move)
@@ -118,3 +145,35 @@ class PickAndPlace:
         samples[:, 1] = direction * rate[:, None]
         samples[:, 2] = direction * rate_change[:, None] + np.outer(bump_curvature * rate**2, up)
         return samples
+
+
+def read_trajectory(table: Table) -> Trajectory | None:
+    """Take the keys of a scene's [reference] table."""
+    kind = table.text("kind", choices=("none", "hold", "lemniscate", "pick_and_place"))
+    if kind == "hold":
+        return Hold(table.vector("position", 2))
+    if kind == "lemniscate":
+        return Lemniscate(
+            centre=table.vector("centre", 2),
+            size=table.vector("size", 2),
+            period=table.number("period", above=0.0),
+            ramp=table.number("ramp", above=0.0),
+        )
+    if kind == "pick_and_place":
+        return PickAndPlace(
+            pick=table.vector("pick", 2),
+            place=table.vector("place", 2),
+            lift=table.number("lift"),
+            wait=table.number("wait", minimum=0.0),
+            move=table.number("move", above=0.0),
+        )
+    return None
+
+
+def _check_points(instance: Trajectory, *names: str) -> None:
+    for name in names:
+        try:
+            point = checked_vector(name, getattr(instance, name), 2).tolist()
+        except ValueError as error:
+            raise ModelError(str(error), key=name) from None
+        object.__setattr__(instance, name, tuple(point))

@@ -22,6 +22,7 @@ from scipy.optimize import brentq
 
 from ..buffered import BufferedFunction, per_thread
 from . import elastica
+from .nearly_straight import nearly_straight
 
 LEAST_CRITICAL_LOAD = 5.7659  # of all rods, at k = 0.9427
 _MAX_LOAD = 600.0  # largest lambda on the sheet, about
@@ -29,7 +30,6 @@ _LAMBDA_STEPS = 480  # RK4 steps along each trajectory
 _COLUMNS = 96  # columns of the tabulated sheet
 _LAUNCH = 1e-4  # delta up to which the pendulum is linear to rounding
 _LOOPED = -13.0  # log(tip_angle) below which the chart stops short of the full loop where stability ends
-_VANISHES = -150.0  # log(tip_angle) below which the determinant is lost in rounding near the full loop
 _TAUT = -21.0  # log(tip_angle) below which that stretch is skipped
 _EDGE = 1e-9  # slack with which a triangle contains a point
 _POLISHED = 1e-12  # distance from the target, in units of L
@@ -85,34 +85,14 @@ class HeldShape:
 
     def nodes(self, n_nodes: int, clamp_angle: float) -> np.ndarray:
         """Nodal states [theta, n_x, n_y, m] for multiple shooting, shape (4, n_nodes), normalised."""
-        launch, state = _launch(np.asarray(self.log_tip_angle))
-        u = self.load * (1.0 - np.arange(n_nodes) / n_nodes)
-        pendulum = np.exp(self.log_tip_angle) * np.stack([np.cosh(u), np.sinh(u)], axis=1)
-        at = float(launch)
-        for j in np.flatnonzero(u > at)[::-1]:
-            substeps = max(1, int(np.ceil(20 * (u[j] - at))))
-            for _ in range(substeps):
-                state = _rk4(_pendulum, state, (u[j] - at) / substeps)
-            pendulum[j], at = state[:2], u[j]
-        delta, rate = pendulum.T
-        theta = self.hand * (delta[0] - delta) + clamp_angle
-        psi = self.hand * delta[0] + clamp_angle
-        force = self.load**2
-        return np.array(
-            [
-                theta,
-                np.full(n_nodes, force * np.cos(psi)),
-                np.full(n_nodes, force * np.sin(psi)),
-                self.hand * self.load * rate,
-            ]
-        )
+        return elastica.nodes(np.array([self.log_tip_angle, self.load, self.hand]), clamp_angle, n_nodes)
 
 
 def stable_shapes(xi: float, eta: float) -> list[HeldShape]:
     """Every stable shape of a rod clamped at the origin along +x with its tip at (xi, eta), exact, by energy.
 
     Complete to the resolution of the chart: pairs of shapes that merge at a fold closer than about 1e-3 in
-    (xi, eta), and shapes that carry more than 1e5 EI/L^2, may be missed.
+    (xi, eta), and shapes that carry more than 1e6 EI/L^2, may be missed.
     """
     found: list[HeldShape] = []
     for coarse in held_shapes(xi, eta):
@@ -133,7 +113,7 @@ def critical_load(log_tip_angle: float) -> float:
     if log_tip_angle < _LOOPED:
         # A full loop is about to leave a taut rod, a little short of 2 K(k).
         full_loop = 2.0 * (np.log(8.0) - log_tip_angle)
-        if log_tip_angle < _VANISHES:
+        if elastica.beyond_numbers(log_tip_angle - np.log(2.0)):
             return float(full_loop - 0.55)
         return float(brentq(determinant, full_loop - 0.8, full_loop - 0.3, xtol=1e-10))
     guess = rough_critical_load(log_tip_angle)
@@ -165,10 +145,13 @@ def held_shapes(xi: float, eta: float) -> list[HeldShape]:
     -------
     list of HeldShape
         By increasing energy, to the resolution of the chart (a start for Newton's method, not a
-        solution). If the tip lies in a gap of the chart (nearly straight rods), the nearest entry.
+        solution), nearly straight ones in closed form. If the tip lies in a gap of the chart, the nearest entry.
     """
     chart = _chart()
     found = []
+    for hand, log_tip_angle, load in nearly_straight(xi, eta):
+        energy = _evaluate_tip(np.array([log_tip_angle, load]), np.zeros(2))[2]
+        found.append(HeldShape(hand, log_tip_angle, load, energy))
     for hand in (1, -1):
         target = np.array([xi, hand * eta])
         rows, weights = _containing(chart, target)
@@ -294,11 +277,6 @@ def _launch(log_tip_angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return u, np.array(
         [np.where(taut, _LAUNCH, tip_angle), np.where(taut, _LAUNCH, 0.0), u, np.where(taut, _LAUNCH, 0.0)]
     )
-
-
-def _pendulum(state: np.ndarray) -> np.ndarray:
-    delta, rate, _, _ = state
-    return np.array([rate, np.sin(delta), np.cos(delta), np.sin(delta)])
 
 
 def _pendulum_with_tangent(state: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ from .rod_solver import RodSolver, Snap
 from .rod_state import RobotState
 from .statics import checked_shooting, make_solver
 from .step_graph import LARGEST_DRIFT, PREDICTOR_ACCURACY, StepModel
+from .step_limit import longest_step
 from .weight import CondensedWeight
 
 # Residual of the statics at which derivatives may be taken for a linear model; their error is of this size.
@@ -164,6 +165,7 @@ class Plant(Remade):
         else:
             self._solver.start(guess.p, guess.q, guess.nodes)
         self._go(p, q, None)
+        self._stiffness = self._solver.jacobians()[0].copy()
         if self._modal is not None:
             self._modal.forget()
         if self.inertia == "constant":
@@ -261,7 +263,8 @@ class Plant(Remade):
         Raises
         ------
         UnreachableError, ConvergenceError, UnstableError
-            The rods could not follow; the exception carries the ``state`` at the start of the step.
+            The rods could not follow, or dt is too long for the tip, which is said; the exception carries the
+            ``state`` at the start of the step.
         """
         x = checked_vector("x", x, self.n_states)
         u = checked_vector("u", u, self.robot.n_rods)
@@ -273,6 +276,8 @@ class Plant(Remade):
                 end = self._advance(self, x, rate, f_ext + self.tip_weight)
         except PCRError as error:
             error.details["state"] = x.copy()
+            if too_long := self._step_too_long():
+                raise type(error)(f"{too_long} (what it came to: {error})", **error.details) from None
             raise
         return np.asarray(end)
 
@@ -292,6 +297,17 @@ class Plant(Remade):
             self._quick.hand_over()
         self._at = None
         self._solver.recall(record)
+
+    def _step_too_long(self) -> str | None:
+        """Whether the integrator is unstable on the stiffness of the rods at the reset, in words."""
+        # Not where they are: a tip that was thrown away has pulled them taut.
+        longest, omega = longest_step(self.integrator, self._stiffness, self._mass[0][:2, :2], self.robot.drag)
+        if self.dt < longest:
+            return None
+        return (
+            f"a step of {self.dt:.3g} s is too long for this tip: its fastest swing has omega dt = "
+            f"{omega * self.dt:.3g}, where {self.integrator} is unstable; take dt below {longest:.2g} s"
+        )
 
     def memory(self, x: np.ndarray) -> np.ndarray:
         """Return what a `step_graph` of ``step_model`` starts from at state x, following the branch."""

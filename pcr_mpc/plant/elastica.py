@@ -13,6 +13,7 @@ iteration per rod. The logarithm is the variable because a taut rod has tip_angl
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import casadi as ca
@@ -23,29 +24,44 @@ from .rod import sample_rod
 
 # Ascending Landen steps: k' falls below 1e-16 from any k >= 1e-6.
 _LANDEN_STEPS = 8
+# Logarithm of the smallest k' of which powers are taken, and of the unit that then takes its place, over k'.
+_SMALLEST, _SHIFT = -100.0, 60.0
+_COARSE = 100.0  # load from which residuals are weighed down
 _SWEEP = 60  # points along the rod at which conjugate points are looked for
 _GENTLE = 2.0  # load below which steps are taken in the components of the force
+_LEAST_LOAD = 1e-3  # of nodes that are a guess
+TAUT = 8.0  # load from which a stable rod is taut: its tip is straight to exp(-8)
 # Angles below this, taken from nodes, are not trusted.
 _ROUNDING = 1e-5
 
 
-def elliptic(u: Any, k: Any, k_prime: Any, steps: int = _LANDEN_STEPS) -> tuple[Any, Any, Any, Any]:
+def elliptic(
+    u: Any, k: Any, k_prime: Any, steps: int = _LANDEN_STEPS, log_k_prime: Any = None
+) -> tuple[Any, Any, Any, Any]:
     """Sn, cn, dn and D = k'^2 int nd^2 du by ascending Landen transformations, with a fixed number of operations.
 
     The modulus is driven to 1, where the functions are hyperbolic and D = 0, so that k' may be as small as it
     likes (DLMF 22.7.6-8; k and k' are both arguments, for neither may come from the other). With
     D = E(am u) - k^2 sn cd, DLMF 19.8.13 becomes a sum of positive terms: nothing cancels.
+
+    With the logarithm of k' too, cn and dn are given in units of k' exp(_SHIFT) where k' is `beyond_numbers`, for there
+    neither it nor they are floating-point numbers, and what is wanted are their ratios.
     """
     moduli, factor = [], ca.SX(1)
     for _ in range(steps):
-        moduli.append((k, k_prime))
+        moduli.append((k, k_prime, k_prime))
         factor *= (1 + k) / 2
         k, k_prime = 2 * ca.sqrt(k) / (1 + k), (k_prime / (1 + k)) ** 2
-    u = u * factor
-    sn, dn = ca.tanh(u), 1 / ca.cosh(u)
+    u = u_shifted = u * factor
+    if log_k_prime is not None:
+        # As cosh(x) is exp(x)/2, cosh(u) k' exp(_SHIFT) is cosh of the sum, but near the tip, where all is straight.
+        tiny = beyond_numbers(log_k_prime)
+        u_shifted = ca.if_else(tiny, ca.fmax(u + log_k_prime + _SHIFT, 0), u)
+        moduli[0] = *moduli[0][:2], ca.if_else(tiny, math.exp(-_SHIFT), moduli[0][1])
+    sn, dn = ca.tanh(u), 1 / ca.cosh(u_shifted)
     cn, d = dn, ca.SX(0)
-    for k, k_prime in reversed(moduli):
-        up = (k_prime / (1 + k)) ** 2  # complementary modulus one step up
+    for k, k_prime, in_its_unit in reversed(moduli):
+        up = (in_its_unit / (1 + k)) ** 2  # complementary modulus one step up
         ratio = up / dn
         sn, cn, dn = 2 / (1 + k) * sn * cn / dn, (1 + k) / (2 * k) * (dn - ratio), (1 + k) / 2 * (dn + ratio)
         d = (1 + k) * d + k_prime**2 / (1 + k) * u + k * sn * (1 - k * cn / dn)
@@ -53,18 +69,28 @@ def elliptic(u: Any, k: Any, k_prime: Any, steps: int = _LANDEN_STEPS) -> tuple[
     return sn, cn, dn, d
 
 
-def pendulum(log_tip_angle: Any, u: Any) -> tuple[Any, Any, Any]:
-    """Angle delta, its rate d delta/du and int cos(delta) du at u."""
-    half = ca.exp(log_tip_angle) / 2
+def beyond_numbers(log_k_prime: Any) -> Any:
+    """Whether k' is too small for its powers to be floating-point numbers, by its logarithm."""
+    return log_k_prime < _SMALLEST
+
+
+def pendulum(log_tip_angle: Any, u: Any, *, any_pull: bool = False) -> tuple[Any, Any, Any]:
+    """Angle delta, its rate d delta/du and int cos(delta) du at u.
+
+    Right up to log(tip_angle) = -300, and beyond with ``any_pull``, which costs more.
+    """
+    half, log_half = ca.exp(log_tip_angle) / 2, log_tip_angle - np.log(2.0)
     k, k_prime = ca.cos(half), ca.sin(half)
-    sn, cn, dn, d = elliptic(u, k, k_prime)
+    sn, cn, dn, d = elliptic(u, k, k_prime, log_k_prime=log_half if any_pull else None)
+    if any_pull:
+        k_prime = ca.if_else(beyond_numbers(log_half), math.exp(-_SHIFT), k_prime)
     delta = 2 * ca.atan2(k_prime / dn, k * cn / dn)
     return delta, 2 * k * sn * (k_prime / dn), u - 2 * d
 
 
-def _tip(log_tip_angle: Any, load: Any) -> tuple[Any, Any, Any, Any]:
+def _tip(log_tip_angle: Any, load: Any, *, any_pull: bool = False) -> tuple[Any, Any, Any, Any]:
     """Tip seen from the clamp (left-handed rod), delta and rate at the base, energy."""
-    delta, rate, c = pendulum(log_tip_angle, load)
+    delta, rate, c = pendulum(log_tip_angle, load, any_pull=any_pull)
     cos, sin = ca.cos(delta), ca.sin(delta)
     # The rate is also int sin(delta) du.
     tip = ca.vertcat(cos * c + sin * rate, sin * c - cos * rate) / load
@@ -82,12 +108,12 @@ def beyond_limit(determinant: Any, unknowns: Any) -> Any:
 def tip_map() -> Any:
     """Graph [log tip_angle, lambda] -> tip (2), its Jacobian (2, 2), energy, for a left-handed rod."""
     unknowns = ca.SX.sym("unknowns", 2)
-    tip, _, _, energy = _tip(unknowns[0], unknowns[1])
+    tip, _, _, energy = _tip(unknowns[0], unknowns[1], any_pull=True)
     return ca.Function("tip_map", [unknowns], [tip, ca.jacobian(tip, unknowns), energy], {"cse": True})
 
 
 @graph_cache()
-def rod_newton() -> tuple[Any, Any]:
+def rod_newton(*, any_pull: bool = False) -> tuple[Any, Any]:
     """Build the graphs of one rod; same arguments and results as `multiple_shooting.rod_newton`.
 
     The unknowns are [log tip_angle, lambda, hand], of which the hand (+1 turns left at the tip, -1 is the
@@ -95,7 +121,7 @@ def rod_newton() -> tuple[Any, Any]:
     """
     unknowns, pose = ca.SX.sym("unknowns", 3), ca.SX.sym("pose", 3)
     load, hand = unknowns[1], unknowns[2]
-    tip, delta, rate, energy = _tip(unknowns[0], load)
+    tip, delta, rate, energy = _tip(unknowns[0], load, any_pull=any_pull)
     # The target is seen from the clamp, mirrored for the right hand.
     turn = ca.vertcat(
         ca.horzcat(ca.cos(pose[2]), ca.sin(pose[2])), hand * ca.horzcat(-ca.sin(pose[2]), ca.cos(pose[2]))
@@ -115,6 +141,9 @@ def rod_newton() -> tuple[Any, Any]:
     moves = inverse @ ca.jacobian(target, pose)
     load_moves = ca.jacobian(loads, unknowns[:2]) @ moves + ca.jacobian(loads, pose)
     norm = ca.norm_2(residual)
+    if any_pull:
+        # The last digit of log tip_angle turns a taut rod by more than the last digit of its tip.
+        norm /= ca.fmax(1, load / _COARSE)
     scalars = ca.vertcat(norm, ca.norm_2(step), energy, beyond_limit(determinant, unknowns), 0)
     results = [ca.vertcat(step, 0), ca.vertcat(moves, ca.SX(1, 3)), loads, load_moves, scalars]
     options = {"cse": True}
@@ -155,7 +184,7 @@ def rod_curvature() -> Any:
 @graph_cache()
 def _pendulums(count: int) -> Any:
     log_tip_angle, u = ca.SX.sym("log_tip_angle"), ca.SX.sym("u")
-    return ca.Function("pendulum", [log_tip_angle, u], list(pendulum(log_tip_angle, u)[:2])).map(count)
+    return ca.Function("pendulum", [log_tip_angle, u], list(pendulum(log_tip_angle, u, any_pull=True)[:2])).map(count)
 
 
 def nodes(unknowns: np.ndarray, angle: float, n_nodes: int) -> np.ndarray:
@@ -169,12 +198,14 @@ def nodes(unknowns: np.ndarray, angle: float, n_nodes: int) -> np.ndarray:
 
 
 @graph_cache()
-def retraction() -> Any:
+def retraction(*, any_pull: bool = False) -> Any:
     """Graph (unknowns, change) -> unknowns: how a step of Newton's method or a prediction is taken.
 
     On gently loaded rods (log tip_angle, lambda) are bad polar coordinates of the tip force, which swings about zero
     as a nearly straight rod is pulled and pushed; there the step goes straight on in its components along and across
-    the tip's tangent.
+    the tip's tangent. On taut rods the tip is all but linear in 1/lambda and in log tip_angle + lambda, which is the
+    angle at the clamp; there, with ``any_pull``, the step goes straight on in these, the load growing to its tenfold
+    at most.
     """
     unknowns, change = ca.SX.sym("unknowns", 3), ca.SX.sym("change", 3)
     tip_angle, load, hand = ca.exp(unknowns[0]), unknowns[1], unknowns[2]
@@ -185,8 +216,27 @@ def retraction() -> Any:
     gentle = ca.vertcat(
         ca.log(ca.atan2(ca.fabs(across), along)), ca.sqrt(ca.sqrt(along**2 + across**2)), ca.if_else(across < 0, -1, 1)
     )
-    taken = ca.if_else(load < _GENTLE, gentle, unknowns + change)
+    straight_on = unknowns + change
+    if any_pull:
+        pulled = load / ca.fmax(1 - change[1] / load, 0.1)
+        taut = ca.vertcat(unknowns[0] + change[0] + change[1] - (pulled - load), pulled, hand)
+        straight_on = ca.if_else(load < TAUT, straight_on, taut)
+    taken = ca.if_else(load < _GENTLE, gentle, straight_on)
     return ca.Function("retraction", [unknowns, change], [taken], {"cse": True})
+
+
+@graph_cache()
+def apart(*, any_pull: bool = False) -> Any:
+    """Graph (unknowns, unknowns) -> how far two shapes are apart, in numbers of order one: see `retraction`."""
+    one, other = ca.SX.sym("one", 3), ca.SX.sym("other", 3)
+    change, load = one - other, ca.fmax(one[1], TAUT)
+    if any_pull:
+        clamp = change[0] + (1 - TAUT / load) * change[1]
+        distance = ca.norm_inf(ca.vertcat(clamp, TAUT / load * change[1], change[2]))
+    else:
+        # Where the graphs are wrong nothing is near.
+        distance = ca.norm_inf(change) + beyond_numbers(one[0])
+    return ca.Function("apart", [one, other], [distance], {"cse": True})
 
 
 @graph_cache()
@@ -212,7 +262,7 @@ def conjugate_points(unknowns: np.ndarray) -> int:
 
 def from_nodes(states: np.ndarray) -> np.ndarray:
     """Unknowns near given nodal states, shape (4, N); exact only as a start for Newton's method."""
-    load = float(np.sqrt(np.hypot(*states[1:3, 0])))
+    load = max(float(np.sqrt(np.hypot(*states[1:3, 0]))), _LEAST_LOAD)
     psi = np.arctan2(states[2, 0], states[1, 0])
     theta = np.append(states[0], sample_rod(states, 2)[2, -1])
     delta = np.angle(np.exp(1j * (psi - theta)))
@@ -231,7 +281,7 @@ def from_nodes(states: np.ndarray) -> np.ndarray:
 
 def from_base(states: np.ndarray) -> np.ndarray:
     """Unknowns near given nodal states by the loads at the base alone: where the tip of a taut rod is all noise."""
-    load = float(np.sqrt(np.hypot(*states[1:3, 0])))
+    load = max(float(np.sqrt(np.hypot(*states[1:3, 0]))), _LEAST_LOAD)
     hand = 1.0 if states[3, 0] >= 0 else -1.0
     delta = float(hand * (np.arctan2(states[2, 0], states[1, 0]) - states[0, 0])) % (2 * np.pi)
     # The pendulum's energy gives the tip angle, unless that is so small that the pendulum is on the separatrix.

@@ -85,7 +85,9 @@ def inverse_statics(
 ) -> Equilibrium:
     """Motor angles that hold the tip at p while the rods carry a given force.
 
-    With more than two rods the angles are not unique: those nearest to the guess are taken.
+    With more than two rods the angles are not unique: those nearest to the guess are taken. Nor are whole turns, which
+    no rod feels: a guess keeps its own; a search takes, of the turns between the stops, the one that leaves the motor
+    nearest to the direction of the rod's chord, from -pi to pi.
 
     Parameters
     ----------
@@ -127,6 +129,10 @@ def inverse_statics(
         try:
             solver.start(p, q)
             eq = solver.equilibrium(p, _turn(solver, p, q, force))
+            unwound = _unwound(robot, p, eq.q)
+            if (unwound != eq.q).any():
+                solver.start(p, unwound)
+                eq = solver.equilibrium(p, unwound)
         except PCRError:
             continue
         lower, upper = robot.angle_limits.T
@@ -154,13 +160,12 @@ def settle(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -
         stiffness, _ = solver.jacobians()
         values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
         # No better than the tip position is resolved, which counts where rods are nearly straight.
-        tolerance = _FORCE_TOLERANCE * _force_scale(robot) + _RESOLUTION * float(robot.lengths.max() * values[-1])
+        tolerance = _FORCE_TOLERANCE * robot.force_scale + _RESOLUTION * float(robot.lengths.max() * values[-1])
         if math.hypot(*residual) <= tolerance:
             if values[0] <= 0 or solver.unstable_rods():
                 raise UnstableError(
                     f"the pose p = {p} m, q = {q} rad is in balance but not stable: smallest stiffness "
-                    f"{values[0]:.4g} N/m, unstable rods {solver.unstable_rods()}; "
-                    "the branch ended, choose other motor angles",
+                    f"{values[0]:.4g} N/m{_named(solver.unstable_rods())}; the branch ended, choose other motor angles",
                     eigenvalue=float(values[0]),
                     rod=solver.unstable_rods(),
                     p=p,
@@ -243,12 +248,16 @@ def _require_equilibrium(guess: Any) -> None:
         raise TypeError(f"guess is a {type(guess).__name__}, expected an Equilibrium")
 
 
+def _named(rods: tuple[int, ...]) -> str:
+    return f", unstable rods {', '.join(map(str, rods))}" if rods else ""
+
+
 def _require_usable(eq: Equilibrium) -> None:
     """Raise if a pose that the motors should hold is unstable or beyond their stops."""
     if not eq.stable:
         raise UnstableError(
             f"the branch leads to a pose at p = {eq.p} m, q = {eq.q} rad that is in balance but not stable: smallest "
-            f"stiffness {eq.stiffness_eigenvalues[0]:.4g} N/m, unstable rods {eq.unstable_rods}; choose a nearer tip "
+            f"stiffness {eq.stiffness_eigenvalues[0]:.4g} N/m{_named(eq.unstable_rods)}; choose a nearer tip "
             "or another working mode",
             eigenvalue=float(eq.stiffness_eigenvalues[0]),
             rod=eq.unstable_rods,
@@ -294,7 +303,7 @@ def _reach(solver: RodSolver, guess: Equilibrium, p: np.ndarray, force: np.ndarr
 
 def _turn(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Turn the motors by Newton's method (least motion if redundant) until the rods carry ``force`` at p."""
-    tolerance = _FORCE_TOLERANCE * _force_scale(solver.robot)
+    tolerance = _FORCE_TOLERANCE * solver.robot.force_scale
     solver.move(p, q)
     residual, trials = force - solver.force(), 0
     while math.hypot(*residual) > tolerance:
@@ -338,7 +347,7 @@ def _tip_starts(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
 
 def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | None) -> list[np.ndarray]:
     """Motor angles within limits whose coarse shapes nearly carry ``force``, best first."""
-    scale = _force_scale(robot)
+    scale = robot.force_scale
     # The coarser, the more rods there are to combine.
     stride = math.ceil(len(_OFFSETS) / max(1, int(_COMBINATIONS ** (1 / robot.n_rods))))
     offsets = _OFFSETS[stride // 2 :: stride]
@@ -348,8 +357,9 @@ def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | No
     for i, rod in enumerate(robot.rods):
         dx, dy = (p - rod.base) / rod.length
         lower, upper = rod.angle_limits
-        angles = lower + (np.arctan2(dy, dx) + offsets - lower) % (2 * np.pi)
-        angles = angles[angles <= upper]
+        chord = np.arctan2(dy, dx)
+        angles = lower + (chord + offsets - lower) % (2 * np.pi)
+        angles = _nearest_turn(angles[angles <= upper], chord, lower, upper)
         if len(angles) < _NARROW:
             angles = np.linspace(lower, upper, _NARROW)
         unit = rod.bending_stiffness / rod.length**2 / scale
@@ -368,8 +378,18 @@ def _angle_starts(robot: Robot, p: np.ndarray, force: np.ndarray, mode: str | No
     return list(np.stack([angles[at] for angles, at in zip(per_rod, chosen, strict=True)], axis=1))
 
 
-def _force_scale(robot: Robot) -> float:
-    return float((robot.stiffnesses / robot.lengths**2).sum())
+def _unwound(robot: Robot, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Motor angles of the same shapes, each on the turn that is nearest to its rod's chord and between the stops."""
+    chords = np.arctan2(*(p - robot.bases).T[::-1])
+    return _nearest_turn(q, chords, *robot.angle_limits.T)
+
+
+def _nearest_turn(angles: np.ndarray, wanted: Any, lower: Any, upper: Any) -> np.ndarray:
+    """Add the whole turns by which angles come nearest to what is wanted and stay within limits, if they can."""
+    turn = 2 * np.pi
+    least, most = np.ceil((lower - angles) / turn), np.floor((upper - angles) / turn)
+    turns = np.minimum(np.maximum(np.round((wanted - angles) / turn), least), most)
+    return np.asarray(np.where(least <= most, angles + turn * turns, angles))
 
 
 def free_solver(robot: Robot) -> RodSolver:

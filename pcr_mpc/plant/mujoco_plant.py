@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ConvergenceError, PCRError, checked_number, checked_vector
+from ..errors import ConvergenceError, PCRError, checked_integer, checked_number, checked_vector
 from ..frozen import Remade, set_once
 from .dynamics import Plant
 from .equilibrium import Equilibrium
@@ -74,12 +74,10 @@ class MuJoCoPlant(Remade):
         links = checked_links(robot, links)
         if not 0.0 < dt < np.inf:
             raise ValueError(f"dt is {dt} s, expected a positive number")
-        if isinstance(substeps, bool) or not isinstance(substeps, int | np.integer) or substeps < 1:
-            raise ValueError(f"substeps = {substeps!r} must be a whole number of at least 1")
         self.robot = robot
         self.links = links
         self.dt = dt
-        self.substeps = int(substeps)
+        self.substeps = checked_integer("substeps", substeps)
         self.extrapolated = extrapolated
         self.n_states = 4 + robot.n_rods
         self.method = f"MuJoCo {self._mujoco.__version__}, {links} links"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, UnreachableError, checked_number, checked_vector
+from ..errors import ModelError, UnreachableError, check_numbers, checked_number, checked_vector
+from ..files import name_problem
 from ..frozen import Frozen, read_only
 from ..toml_table import read_toml
 
@@ -35,6 +37,8 @@ _ROBOT_NUMBERS = {
 _LEAST_SLACK = 1e-9
 # Beyond it the rounding of an angle, 1e-10 rad, shows in the shape of a rod [rad].
 _LARGEST_ANGLE = 1e6
+# Angles beyond four turns are rather degrees [rad].
+_MANY_TURNS = 8.0 * math.pi
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class Rod:
     line_density : float
         Mass per length [kg/m]; the massless model of the paper does not use it.
     angle_limits : (float, float)
-        Least and greatest motor angle [rad].
+        Least and greatest motor angle [rad]; refused where they hold no angle within four turns of zero.
     curvature : float or tuple of float
         kappa0 at rest [1/m], positive to the left: one number, or values at equally spaced s from base to tip, linear
         in between.
@@ -72,18 +76,23 @@ class Rod:
     axial_stiffness: float = math.inf
 
     def __post_init__(self) -> None:
-        _check_numbers(self, _ROD_NUMBERS)
+        check_numbers(self, _ROD_NUMBERS)
         lowest, highest = _STIFFNESS_RANGE
         _check_profile(self, "curvature", minimum=-1e30, maximum=1e30)
         _check_profile(self, "stiffness_factors", minimum=lowest, maximum=highest)
         if self.axial_stiffness != math.inf:
-            _check_numbers(self, {"axial_stiffness": _POSITIVE})
+            check_numbers(self, {"axial_stiffness": _POSITIVE})
         for name in ("base", "angle_limits"):
             pair = checked_vector(name, getattr(self, name), 2)
             object.__setattr__(self, name, tuple(pair.tolist()))
         lower, upper = self.angle_limits
         if lower >= upper:
             raise ModelError(f"angle_limits: lower {lower} is not below upper {upper}", key="angle_limits")
+        if lower > _MANY_TURNS or upper < -_MANY_TURNS:
+            raise ModelError(
+                f"angle_limits: {_doubtful_limits(self)}; take off the whole turns, or write radians",
+                key="angle_limits",
+            )
 
     @property
     def curvatures(self) -> tuple[float, ...]:
@@ -130,7 +139,9 @@ class Robot(Frozen):
     gravity: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        _check_numbers(self, _ROBOT_NUMBERS)
+        if problem := name_problem(self.name):
+            raise ModelError(f"name: {problem}", key="name")
+        check_numbers(self, _ROBOT_NUMBERS)
         object.__setattr__(self, "gravity", tuple(checked_vector("gravity", self.gravity, 2).tolist()))
         object.__setattr__(self, "rods", tuple(self.rods))
         for rod in self.rods:
@@ -186,6 +197,11 @@ class Robot(Frozen):
         return read_only(np.array([rod.bending_stiffness for rod in self.rods]))
 
     @cached_property
+    def force_scale(self) -> float:
+        """Sum of EI/L^2, the size of the rods' forces [N]."""
+        return float((self.stiffnesses / self.lengths**2).sum())
+
+    @cached_property
     def angle_limits(self) -> np.ndarray:
         """Least and greatest motor angles, shape (n, 2) [rad]."""
         return read_only(np.array([rod.angle_limits for rod in self.rods]))
@@ -233,6 +249,15 @@ class Robot(Frozen):
                 )
 
 
+def _doubtful_limits(rod: Rod) -> str:
+    low, high = rod.angle_limits
+    degrees = [math.radians(angle) for angle in rod.angle_limits]
+    return (
+        f"[{low:g}, {high:g}] rad reach {max(-low, high) / (2 * math.pi):.3g} turns from zero; if these are degrees, "
+        f"they are [{degrees[0]:.4g}, {degrees[1]:.4g}] rad"
+    )
+
+
 def _check_profile(rod: Rod, key: str, *, minimum: float, maximum: float) -> None:
     """Replace a property along the rod by a tuple of floats, or by a float if it is one number."""
     value = getattr(rod, key)
@@ -249,14 +274,6 @@ def _check_profile(rod: Rod, key: str, *, minimum: float, maximum: float) -> Non
         raise ModelError(str(error), key=key) from None
 
 
-def _check_numbers(instance: Any, bounds: dict[str, dict[str, float]]) -> None:
-    for name, bound in bounds.items():
-        try:
-            object.__setattr__(instance, name, checked_number(name, getattr(instance, name), **bound))
-        except ValueError as error:
-            raise ModelError(str(error), key=name) from None
-
-
 def load_robot(path: str | Path) -> Robot:
     """Read a robot from TOML (see ``models/planar_pair.toml``).
 
@@ -264,10 +281,15 @@ def load_robot(path: str | Path) -> Robot:
     ------
     ModelError
         A key is missing, misspelt, of the wrong type or out of range.
+
+    Warns
+    -----
+    UserWarning
+        A motor may turn more than four turns from zero: its limits look like degrees.
     """
     with read_toml(path) as file:
         name = file.text("name")
-        rods = []
+        rods: list[Rod] = []
         for table in file.tables("rods"):
             with table:
                 rods.append(
@@ -282,6 +304,8 @@ def load_robot(path: str | Path) -> Robot:
                         axial_stiffness=table.number("axial_stiffness", math.inf),
                     )
                 )
+            if max(map(abs, rods[-1].angle_limits)) > _MANY_TURNS:
+                warnings.warn(f"{path}: rods.angle_limits: {_doubtful_limits(rods[-1])}", stacklevel=2)
         with file.table("world", {}) as world:
             gravity = world.vector("gravity", 2, (0.0, 0.0))
         with file.table("tip") as tip, file.table("motors") as motors:

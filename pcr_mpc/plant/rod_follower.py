@@ -12,7 +12,7 @@ from ..errors import ConvergenceError
 from . import elastica
 from .chart import critical_load, held_shapes
 from .rod import RodPhysics
-from .rod_method import RodMethod
+from .rod_method import RodMethod, enough_nodes
 from .rod_physics import plain_physics
 from .rod_state import RodState
 from .snap import landing
@@ -25,6 +25,8 @@ BRANCH_CHANGE = 0.3
 # A rod that can be followed no further with less than this left to lambda_c has come to a fold.
 _FOLD_MARGIN = 0.15
 _SMALLEST_SUBSTEP = 1.0 / 1024.0
+# Slack, in units of L, below which the smallest sub-step shrinks with it, as what changes a rod does; the least.
+_STRAIGHT, _STRAIGHTEST = 0.01, 1e-8
 _SNAP_NODES = 64
 # A cold start of a rod that is not plain begins at a tip no further from its base than this, in units of L.
 _WELL_BENT = 0.9
@@ -68,9 +70,7 @@ class RodFollower:
     def __init__(self, method: RodMethod, physics: RodPhysics | None = None) -> None:
         self.method = method
         self._physics = physics
-        self._newton = BufferedFunction(method.newton)
-        self._check = BufferedFunction(method.residual)
-        self._retract = BufferedFunction(method.retract)
+        self._newton, self._check, self._retract, self._distance = map(BufferedFunction, method.any_pull)
         if physics is not None:
             self._become(physics.values)
 
@@ -101,8 +101,7 @@ class RodFollower:
                 self._become(plain + target * (physics.values - plain))
                 try:
                     grown = self.solve(pose, predicted, most=_WARM_ITERATIONS)
-                    moved = np.abs((grown.unknowns - predicted)[self.method.branch]).max()
-                    if moved > BRANCH_CHANGE or not grown.stable:
+                    if self._apart(grown.unknowns, predicted) > BRANCH_CHANGE or not grown.stable:
                         raise NotConverged(grown.residual, grown.iterations, grown.unknowns, "left its branch")
                 except NotConverged as failure:
                     step /= 2
@@ -152,6 +151,8 @@ class RodFollower:
                 raise
             first = failure
         # Continuation along the straight line from the last pose, sub-steps halved and doubled as they go.
+        slack = max(_STRAIGHTEST, 1.0 - max(math.hypot(*start.pose[:2]), math.hypot(*pose[:2])))
+        smallest = _SMALLEST_SUBSTEP * min(1.0, slack / _STRAIGHT)
         state, done, substep, crossed = start, 0.0, 0.5, False
         while done < 1.0:
             target = 1.0 if done + substep >= 1.0 else done + substep
@@ -160,7 +161,7 @@ class RodFollower:
             except NotConverged as failure:
                 substep /= 2
                 crossed = crossed or isinstance(failure, _Crossed)
-                if substep < _SMALLEST_SUBSTEP:
+                if substep < smallest:
                     margin = self._margin(state)
                     if margin > _FOLD_MARGIN or (math.isnan(margin) and not crossed):
                         raise first from None
@@ -171,7 +172,7 @@ class RodFollower:
 
     def snap(self, fold: BranchEnds) -> RodState:
         """Stable shape to which the rod descends where its branch ends."""
-        last, branch = fold.last, self.method.branch
+        last = fold.last
         nodes = self.method.to_nodes(last.unknowns, last.pose[2], _SNAP_NODES)
         # Just beyond the fold the slope is hardly one, and a chain of links folds a little later than a rod: look
         # further and further until the shape is gone, and come back along the shape that is found.
@@ -181,7 +182,7 @@ class RodFollower:
             distance *= 2.0
             try:
                 state = self.from_nodes(pose, landing(nodes, pose))
-                elsewhere = np.abs((state.unknowns - last.unknowns)[branch]).max() > BRANCH_CHANGE
+                elsewhere = self._apart(state.unknowns, last.unknowns) > BRANCH_CHANGE
                 if elsewhere and state.stable and state.energy < last.energy:
                     return replace(self.follow(state, last.pose + fold.step), rung="snap")
             except (NotConverged, ConvergenceError):
@@ -250,19 +251,24 @@ class RodFollower:
         self._retract()
         return self._retract.outputs[0].copy()
 
+    def _apart(self, one: np.ndarray, other: np.ndarray) -> float:
+        """How far two shapes of the rod are from each other, in numbers of order one."""
+        self._distance.inputs[0][:], self._distance.inputs[1][:] = one, other
+        self._distance()
+        return float(self._distance.outputs[0][0])
+
     def _margin(self, state: RodState) -> float:
         """1 - lambda / lambda_c, known of plain rods only."""
         if self._physics is not None:
             return math.nan
-        nodes = self.method.to_nodes(state.unknowns, state.pose[2], _SNAP_NODES)
+        nodes = self.method.to_nodes(state.unknowns, state.pose[2], enough_nodes(state.loads, _SNAP_NODES))
         log_tip_angle, load, _ = elastica.from_nodes(nodes)
         return 1.0 - float(load) / critical_load(float(log_tip_angle))
 
     def _predict(self, start: RodState, pose: np.ndarray, derivatives: float | None) -> RodState:
         predicted = self._step(start.unknowns, start.tangent @ (pose - start.pose))
         state = self.solve(pose, predicted, derivatives, _WARM_ITERATIONS)
-        branch = self.method.branch
-        if np.abs(state.unknowns[branch] - predicted[branch]).max() > BRANCH_CHANGE:
+        if self._apart(state.unknowns, predicted) > BRANCH_CHANGE:
             raise NotConverged(state.residual, state.iterations, state.unknowns, "left its branch")
         # A stable branch does not turn unstable: it ends, and Newton's method landed on its other side.
         if start.stable and not state.stable:

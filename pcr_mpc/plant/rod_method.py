@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -38,6 +39,25 @@ class Shooting:
     scheme: str = "rk8"
 
 
+class RodGraphs(NamedTuple):
+    """Graphs by which a rod is solved.
+
+    Attributes
+    ----------
+    newton, residual : casadi.Function
+        See `multiple_shooting.rod_newton`.
+    retract : casadi.Function
+        (unknowns, change) -> unknowns: how a step is taken.
+    apart : casadi.Function
+        (unknowns, unknowns) -> how far two shapes are apart, in numbers of order one: a warm start may not change much.
+    """
+
+    newton: Any
+    residual: Any
+    retract: Any
+    apart: Any
+
+
 @dataclass(frozen=True, eq=False)
 class RodMethod:
     """One way to solve a rod: its graphs, and how its unknowns relate to shapes.
@@ -45,18 +65,16 @@ class RodMethod:
     Attributes
     ----------
     name : str
-    newton, residual : casadi.Function
-        See `multiple_shooting.rod_newton`.
-    retract : casadi.Function
-        (unknowns, change) -> unknowns: how a step is taken.
+    newton, residual, retract, apart : casadi.Function
+        `RodGraphs` of the warm step.
+    any_pull : RodGraphs
+        Of all other rungs: for rods however taut, where those of the warm step do not know them.
     chord : casadi.Function or None
         (unknowns, pose, tangent) -> change: a cheap iteration with derivatives that are there, if there is one.
     tolerance : float
         Residual at which a rod counts as solved: rounding.
     following : float
         Residual that will do from one time step of a simulation to the next.
-    branch : slice
-        The unknowns of order one that a warm start may not change much.
     from_shape : callable
         (shape, clamp angle) -> unknowns: a cold start.
     from_nodes : callable
@@ -73,10 +91,11 @@ class RodMethod:
     newton: Any
     residual: Any
     retract: Any
+    apart: Any
+    any_pull: RodGraphs
     chord: Any
     tolerance: float
     following: float
-    branch: slice
     from_shape: Callable[[HeldShape, float], np.ndarray]
     from_nodes: Callable[[np.ndarray, RodPhysics | None], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
@@ -96,16 +115,19 @@ def shooting_method(shooting: Shooting, layout: Layout | None) -> RodMethod:
         same = nodes.shape[1] == n
         return [(nodes if same else sample_rod(nodes, n + 1, of_rod)[2:, :n]).ravel(order="F")]
 
+    retract = ca.Function("retraction", [start, change], [start + change])
+    apart = ca.Function("apart", [start, change], [ca.norm_inf((start - change)[0::4])])
     return RodMethod(
         name="multiple_shooting",
         newton=newton,
         residual=residual,
-        retract=ca.Function("retraction", [start, change], [start + change]),
+        retract=retract,
+        apart=apart,
+        any_pull=RodGraphs(newton, residual, retract, apart),
         chord=None,
         # Relative to the load; on taut rods the equations have a condition of 1e8.
         tolerance=1e-10,
         following=1e-10,
-        branch=slice(0, None, 4),
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
         to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
@@ -123,10 +145,13 @@ def closed_form_method() -> RodMethod:
         newton=newton,
         residual=residual,
         retract=elastica.retraction(),
+        apart=elastica.apart(),
+        any_pull=RodGraphs(
+            *elastica.rod_newton(any_pull=True), elastica.retraction(any_pull=True), elastica.apart(any_pull=True)
+        ),
         chord=elastica.rod_chord(),
         tolerance=1e-13,
         following=1e-11,
-        branch=slice(0, 3),
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=lambda nodes, _: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
         to_nodes=elastica.nodes,
@@ -166,7 +191,6 @@ def warm_calls(kind: Kind, method: RodMethod, iterations: int) -> Any:
     unknowns, tangents, poses = (
         ca.reshape(block, -1, columns) for block, columns in zip(blocks, (n, 3 * n, n), strict=True)
     )
-    branch = list(range(width))[method.branch]
     columns: dict[str, list[Any]] = {name: [] for name in ("u", "t", "pose", "loads", "load_t", "scalars")}
     residuals, roughest, changes = [], [], []
     force, k, g = ca.MX(2, 1), ca.MX(2, 2), []
@@ -185,7 +209,7 @@ def warm_calls(kind: Kind, method: RodMethod, iterations: int) -> Any:
             columns[name].append(value)
         residuals.append(residual)
         roughest.append(scalars[0])
-        changes.append(ca.norm_inf((u - predicted)[branch]))
+        changes.append(method.apart(u, predicted))
         unit = rod.bending_stiffness / rod.length**2
         force += unit * loads[:2]
         k += unit / rod.length * load_tangent[:2, :2]
@@ -197,6 +221,12 @@ def warm_calls(kind: Kind, method: RodMethod, iterations: int) -> Any:
     record = ca.vertcat(*(ca.vec(ca.horzcat(*found)) for found in columns.values()))
     result = ca.vertcat(force, ca.vec(k), ca.vec(ca.horzcat(*g)))
     return ca.Function("warm_step", [target, start_record, vector], [record, verdict, result])
+
+
+def enough_nodes(loads: np.ndarray, least: int) -> int:
+    """Nodes at most 4 / lambda apart, so that integrating between them is stable on taut rods; a power of two."""
+    load = math.sqrt(float(np.hypot(*loads[:2]).max()))
+    return max(least, 1 << max(0, math.ceil(math.log2(max(load, 1.0) / 4.0))))
 
 
 def inlined(function: Any, of_rod: Any) -> Any:

@@ -14,7 +14,7 @@ from .equilibrium import Equilibrium
 from .numbers import Kind
 from .robot import Robot
 from .rod_follower import BRANCH_CHANGE, BranchEnds, NotConverged, RodFollower
-from .rod_method import RodMethod, warm_step
+from .rod_method import RodMethod, enough_nodes, warm_step
 from .rod_physics import in_layout, require_plain
 from .rod_state import RobotState, RodState
 
@@ -240,9 +240,7 @@ class RodSolver:
         """Everything about the last pose, which was solved at (p, q)."""
         state = self.state
         k, g = self.jacobians()
-        # Nodes at most 4 / lambda apart, so that integrating between them is stable on taut rods.
-        load = math.sqrt(float(np.hypot(*state.loads[:2]).max()))
-        n_nodes = max(8, 2 ** math.ceil(math.log2(max(load, 1.0) / 4.0)))
+        n_nodes = enough_nodes(state.loads, 8)
         nodes = [
             self.method.to_nodes(u, pose[2], n_nodes) for u, pose in zip(state.unknowns.T, state.poses.T, strict=True)
         ]
@@ -292,11 +290,12 @@ class RodSolver:
                 margin=failure.margin,
             )
         base = np.array(self.robot.rods[rod].base)
+        more = ", use more segments" if self.method.name == "multiple_shooting" else ""
         reach = float(np.hypot(*(np.array(p) - base))) / self.robot.rods[rod].length
         return ConvergenceError(
             f"rod {rod} at p = {np.array(p)} m, q = {np.array(q)} rad (stretched to {reach:.4f} of its "
             f"length): {failure}; residual {failure.residual:.2e} after {failure.iterations} iterations; "
-            "move in smaller steps, pass a closer guess, or use more segments",
+            f"move in smaller steps{more}, or pass a closer guess",
             rod=rod,
             residual=failure.residual,
             iterations=failure.iterations,

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ..buffered import BufferedFunction, graph_cache, per_thread
-from ..errors import PCRError, checked_array
+from ..errors import PCRError, checked_array, checked_integer
 from ..frozen import Frozen
 from .dynamics import Plant
 from .equilibrium import Equilibrium
@@ -89,8 +89,7 @@ def rollout(
     """
     if plant.step_model is None:
         raise ValueError(f"method {plant.method!r} with inertia {plant.inertia!r} has no rollout; use Plant.step")
-    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
-        raise ValueError(f"threads is {threads!r}, expected a whole number of at least 1")
+    threads = checked_integer("threads", threads)
     starts, inputs, f_ext, many = _checked(plant, x0, inputs, f_ext, robots)
     count, steps = inputs.shape[:2]
     plants = [plant] * count if robots is None else [plant.of(robot) for robot in robots]

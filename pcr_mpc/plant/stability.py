@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import ConvergenceError, PCRError, checked_vector
 from ..frozen import Frozen
 from . import elastica
-from .chart import HeldShape, critical_load, stable_shapes
+from .chart import LEAST_CRITICAL_LOAD, HeldShape, critical_load, stable_shapes
 from .equilibrium import Equilibrium
 from .free_tip import free_solver, settle
 from .multiple_shooting import rod_newton
@@ -22,6 +22,9 @@ from .rod_physics import require_plain
 from .rod_solver import RodSolver
 
 _MAX_ITERATIONS = 40
+_NEAR = 0.3  # margin of a rod below which it is computed exactly
+_BALANCED = 1e-9  # residual force, of sum EI/L^2
+_SAME = 1e-4  # of the rods' length, and of EI/L^2 and their forces, within which two poses are one
 _RESOLVED = 1e-5  # residual and drift at which the sweep is trusted
 
 
@@ -76,6 +79,23 @@ def assess_stability(eq: Equilibrium) -> Stability:
     )
 
 
+def least_rod_margin(eq: Equilibrium) -> float:
+    """Least 1 - lambda / lambda_c of the rods, exact below 0.3, above that at least so much; NaN if they are not plain.
+
+    Cheaper than `assess_stability`, where many poses are gone through.
+    """
+    if eq.robot.needs_shooting is not None:
+        return float("nan")
+    margins = []
+    for nodes in eq.nodes:
+        bound = 1.0 - float(np.sqrt(np.hypot(*nodes[1:3, 0]))) / LEAST_CRITICAL_LOAD
+        if bound < _NEAR:
+            log_tip_angle, load, _ = elastica.from_nodes(nodes)
+            bound = 1.0 - load / critical_load(log_tip_angle)
+        margins.append(bound)
+    return min(margins)
+
+
 def count_conjugate_points(eq: Equilibrium, segments: int = 16) -> int:
     """Unstable directions of the rods with the tip held, by a sweep over the rod equation from the tip.
 
@@ -97,8 +117,9 @@ def count_conjugate_points(eq: Equilibrium, segments: int = 16) -> int:
         residual, _, _, conjugate_points, drift = newton(sampled.ravel(order="F"), pose, *known)[4].full().ravel()
         if not (residual < _RESOLVED and abs(drift) < _RESOLVED):
             raise ConvergenceError(
-                f"a rod is too taut for {segments} segments: its state drifts by {abs(drift):.1e} along the sweep "
-                f"(at most {_RESOLVED:.0e}); use more segments, or assess_stability",
+                f"a rod is too taut for {segments} segments: along the sweep its residual is {residual:.1e} and its "
+                f"state drifts by {abs(drift):.1e} (at most {_RESOLVED:.0e} each); use more segments, or "
+                "assess_stability",
                 residual=residual,
                 iterations=0,
                 last=sampled,
@@ -160,15 +181,15 @@ def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0
     q : array_like, shape (n,)
         Motor angles [rad].
     force : array_like, shape (2,)
-        External force on a free tip [N].
+        External force on a free tip besides its own weight m g [N], as `forward_statics` takes it.
 
     Returns
     -------
     list of Equilibrium
-        By energy (free tip: potential energy), each with its verdict ``stable``. A held tip's list is complete to
-        the resolution of the chart (see `chart.stable_shapes`). A free tip's holds every pose to which Newton's
-        method or the energy's descent lead from tip positions L/8 apart on every sheet of stable rods; nothing
-        proves that there are no others.
+        By energy (free tip: potential energy, that of the weight included), each with its verdict ``stable``. A held
+        tip's list is complete to the resolution of the chart (see `chart.stable_shapes`). A free tip's holds every
+        pose to which Newton's method or the energy's descent lead from tip positions L/8 apart on every sheet of
+        stable rods; nothing proves that there are no others.
 
     Raises
     ------
@@ -178,7 +199,7 @@ def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0
         The rods are not plain: the chart of stable shapes is of plain rods.
     """
     require_plain(robot, "all_equilibria")
-    q, force = checked_vector("q", q, robot.n_rods), checked_vector("force", force, 2)
+    q, force = checked_vector("q", q, robot.n_rods), checked_vector("force", force, 2) + robot.tip_weight
     if p is not None:
         p = checked_vector("p", p, 2)
         robot.require_reachable(p)
@@ -223,13 +244,12 @@ def _held(robot: Robot, p: np.ndarray, q: np.ndarray) -> list[Equilibrium]:
 def _balance(solver: RodSolver, start: Equilibrium, force: np.ndarray) -> Equilibrium | None:
     """Newton's method on F(p, q) = force, to a stable or an unstable pose; None if it leads nowhere."""
     robot, p, q = start.robot, start.p, start.q
-    scale = float((robot.stiffnesses / robot.lengths**2).sum())
     longest = 0.1 * robot.lengths.min()
     try:
         solver.start(p, q, start.nodes)
         for _ in range(_MAX_ITERATIONS):
             residual = solver.force() - force
-            if np.linalg.norm(residual) < 1e-9 * scale:
+            if np.linalg.norm(residual) < _BALANCED * robot.force_scale:
                 eq = solver.equilibrium(p, q)
                 return None if eq.unstable_rods else eq
             step = -np.linalg.solve(solver.jacobians()[0], residual)
@@ -251,4 +271,7 @@ def _descend(solver: RodSolver, start: Equilibrium, force: np.ndarray) -> Equili
 
 
 def _same(a: Equilibrium, b: Equilibrium) -> bool:
-    return bool(np.allclose(a.p, b.p, atol=1e-6) and np.allclose(a.rod_forces, b.rod_forces, atol=1e-4))
+    length = a.robot.lengths.min()
+    unit = (a.robot.stiffnesses / a.robot.lengths**2)[:, None]
+    near = np.abs(a.p - b.p).max() <= _SAME * length
+    return bool(near and (np.abs(a.rod_forces - b.rod_forces) <= _SAME * (unit + np.abs(b.rod_forces))).all())

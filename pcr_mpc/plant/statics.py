@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..buffered import per_thread
-from ..errors import ConvergenceError, checked_vector
+from ..errors import ConvergenceError, checked_integer, checked_vector
+from ..methods import METHODS
 from .equilibrium import Equilibrium
 from .robot import Robot
 from .rod import SCHEMES
@@ -25,7 +26,6 @@ _TAUT = 0.05
 _STRETCH = 5e-4  # least slack that counts for a rod that stretches
 # Integration steps along a rod for which a graph may be built: half a minute and 1 GB.
 _MOST_STEPS = 1024
-METHODS = ("closed_form", "multiple_shooting", "single_shooting")
 
 
 def solve_statics(
@@ -142,14 +142,12 @@ def default_method(robot: Robot) -> str:
 
 def checked_shooting(segments: int, steps: int, scheme: str) -> Shooting:
     """Return the discretisation if it makes sense, or raise ValueError."""
-    for name, count in (("segments", segments), ("steps", steps)):
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise ValueError(f"{name} = {count!r} must be a whole number of at least 1")
+    segments, steps = checked_integer("segments", segments), checked_integer("steps", steps)
     if segments * steps > _MOST_STEPS:
         raise ValueError(f"segments = {segments} times steps = {steps} is more than {_MOST_STEPS}")
     if scheme not in SCHEMES:
         raise ValueError(f"scheme is {scheme!r}, expected one of {', '.join(SCHEMES)}")
-    return Shooting(int(segments), int(steps), scheme)
+    return Shooting(segments, steps, scheme)
 
 
 @per_thread(maxsize=32)

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..files import replacing
+
 
 def write_rows(
     path: Path, rows: Sequence[Mapping[str, Any]], columns: Iterable[str] | None = None, digits: int | None = None
@@ -25,7 +27,7 @@ def write_rows(
     """
     names = list(dict.fromkeys(name for row in rows for name in row) if columns is None else columns)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="", encoding="utf-8") as handle:
+    with replacing(path) as draft, open(draft, "w", newline="", encoding="utf-8") as handle:
         writer = csv.DictWriter(handle, fieldnames=names, restval="", extrasaction="ignore")
         writer.writeheader()
         for row in rows:

@@ -9,13 +9,18 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from tqdm import tqdm
 
+from .. import interrupt
+from ..files import replacing
 from ..loop.run import Run
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
-from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt
+from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt, save_figure
+from .tables import without_rounding
 
 _FRAMES_PER_SECOND = 20
 _LONGEST_ANIMATION = 4.0  # s of the run shown
+_USUAL_TIMES = (5.0, 2e4)  # us, of a histogram; wider where a step took less or more
+_LEAST_SHARE = 0.02  # of an error's samples that may lie below its logarithmic axis
 
 
 def draw_robot(axes: Any, eq: Equilibrium, alpha: float = 1.0) -> None:
@@ -32,6 +37,7 @@ def frame(axes: Any, shapes: np.ndarray, margin: float = 0.03) -> None:
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal")
+    axes.locator_params(nbins=6)  # or the numbers run into each other
 
 
 def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
@@ -39,13 +45,11 @@ def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
     figure, axes = plt.subplots(figsize=(6, 5))
     draw_robot(axes, eq)
     frame(axes, eq.shape(60))
-    verdict = "stable" if eq.stable else "unstable"
+    verdict, force = "stable" if eq.stable else "unstable", without_rounding(eq.force, eq.robot.force_scale)
     axes.set_title(
-        f"{eq.robot.name}: mode {eq.mode}, {verdict}\nF = ({eq.force[0]:.3g}, {eq.force[1]:.3g}) N, "
-        f"U = {eq.energy:.4g} J"
+        f"{eq.robot.name}: mode {eq.mode}, {verdict}\nF = ({force[0]:.3g}, {force[1]:.3g}) N, U = {eq.energy:.4g} J"
     )
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
@@ -64,8 +68,7 @@ def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
                        color="black" if eq.stable else RED)  # fmt: skip
     for axes in panels.flat[len(found) :]:
         axes.set_visible(False)
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
@@ -76,6 +79,7 @@ def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
     # The branch is followed through every tenth state, not jumped to.
     found = {}
     for k in range(len(run.x)):
+        interrupt.check()
         if k in wanted or k % 10 == 0:
             eq = plant.equilibrium(run.x[k]) if k in wanted else None
             if eq is None:
@@ -99,11 +103,11 @@ def plot_run(run: Run, path: Path) -> None:
         path_axes.plot(*run.reference.T, color=GREY, lw=4, alpha=0.5, label="reference", zorder=6)
     path_axes.plot(*run.x[:, :2].T, color=RED, lw=1.2, label="tip", zorder=7)
     frame(path_axes, np.concatenate([run.x[:, :2], *(eq.shape(60).reshape(-1, 2) for eq in shown)]))
-    path_axes.legend(loc="lower center", ncols=2)
+    path_axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)  # below the rods, wherever they are
     path_axes.set_title(f"{run.scene.name}: robot and path of the tip")
 
     if tracked:
-        error_axes.semilogy(run.t, np.maximum(1e3 * run.error, 1e-7), color=BLUE, lw=1.0)
+        plot_error(error_axes, run.t, 1e3 * run.error)
         late = summary["rms_after_1s_mm"]
         if late is not None:
             error_axes.axhline(late, color=ORANGE, ls="--", label=f"RMS after 1 s: {late:.2g} mm")
@@ -118,12 +122,14 @@ def plot_run(run: Run, path: Path) -> None:
 
     periods = run.scene.period * np.arange(len(run.u))
     for i, rates in enumerate(run.u.T):
-        input_axes.step(periods, rates, where="post", color=RODS[i % len(RODS)], lw=1.2, label=f"motor {i + 1}")
+        input_axes.step(periods, rates, where="post", color=RODS[i % len(RODS)], lw=1.2, label=f"motor {i} (q{i})")
     limit = run.scene.robot.rate_limit
+    highest = max(limit, float(np.abs(run.u).max(initial=0.0)))
     for sign in (-1, 1):
         input_axes.axhline(sign * limit, color=RED, ls=":", label="limit" if sign > 0 else None)
-    input_axes.set(xlabel="t [s]", ylabel="motor rate [rad/s]", title="Inputs", ylim=(-1.35 * limit, 1.35 * limit))
-    input_axes.legend(loc="upper center", ncols=4)
+    input_axes.set(xlabel="t [s]", ylabel="motor rate [rad/s]", title="Inputs, as decided",
+                   ylim=(-1.1 * highest, 1.1 * highest))  # fmt: skip
+    input_axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
 
     plot_times(
         time_axes,
@@ -134,22 +140,33 @@ def plot_run(run: Run, path: Path) -> None:
         },
     )
     figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
+
+
+def plot_error(axes: Any, t: np.ndarray, error_mm: np.ndarray) -> None:
+    """Draw an error on a logarithmic axis that begins where the error does, but for its first zeros."""
+    positive = error_mm[error_mm > 0]
+    axes.plot(t, np.where(error_mm > 0, error_mm, np.nan), color=BLUE, lw=1.0)
+    if len(positive):
+        lowest = 10.0 ** np.floor(np.log10(np.quantile(positive, _LEAST_SHARE)))
+        axes.set_yscale("log")
+        axes.set_ylim(lowest, 2.0 * positive.max())
 
 
 def plot_times(axes: Any, samples: dict[str, tuple[np.ndarray, str]], budgets: dict[str, tuple[float, str]]) -> None:
     """Histogram of step times on a logarithmic axis, with budgets as lines."""
     shown = {name: pair for name, pair in samples.items() if len(pair[0]) and pair[0].max() > 0}
-    bins = np.geomspace(5, 2e4, 90)
+    low, high = _USUAL_TIMES
+    for values, _ in shown.values():
+        low, high = min(low, 0.9 * values[values > 0].min()), max(high, 1.1 * values.max())
+    bins = np.geomspace(low, high, 90)
     for name, (values, colour) in shown.items():
-        axes.hist(values, bins=bins, weights=np.full(len(values), 100 / len(values)), color=colour, alpha=0.6,
-                  label=f"{name}, median {np.median(values):.0f} us")  # fmt: skip
+        axes.hist(np.maximum(values, low), bins=bins, weights=np.full(len(values), 100 / len(values)), color=colour,
+                  alpha=0.6, label=f"{name}, median {np.median(values):.0f} us")  # fmt: skip
     for name, (budget, colour) in budgets.items():
         axes.axvline(budget, color=colour, ls="--", label=f"budget of the {name}")
     axes.set(xscale="log", xlabel="wall time [us]", ylabel="share of steps [%]", title="Step times")
-    axes.set_ylim(0, 1.5 * axes.get_ylim()[1])
-    axes.legend(loc="upper left", fontsize=8)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=8)
 
 
 def animate_run(run: Run, path: Path, progress: bool = False) -> None:
@@ -167,11 +184,12 @@ def animate_run(run: Run, path: Path, progress: bool = False) -> None:
     axes.plot(*run.scene.robot.bases.T, "s", color="black", ms=8)
     (trace,) = axes.plot([], [], color=RED, lw=1.2)
     (tip,) = axes.plot([], [], "o", color="black", ms=8)
-    clock = axes.text(0.02, 0.97, "", transform=axes.transAxes, va="top")
+    clock = axes.set_title(" ")  # above the rods
     figure.tight_layout()
     bar = tqdm(total=len(indices), desc="animation", unit="frame", disable=not progress)
 
     def show(i: int) -> list[Any]:
+        interrupt.check()
         for line, shape in zip(rods, shapes[i], strict=True):
             line.set_data(*shape.T)
         trace.set_data(*run.x[: indices[i] + 1, :2].T)
@@ -181,6 +199,9 @@ def animate_run(run: Run, path: Path, progress: bool = False) -> None:
         return [*rods, trace, tip, clock]
 
     animation = FuncAnimation(figure, show, frames=len(indices), init_func=lambda: [], blit=False)
-    animation.save(path, writer=PillowWriter(fps=_FRAMES_PER_SECOND))
-    bar.close()
-    plt.close(figure)
+    try:
+        with replacing(path) as draft:
+            animation.save(draft, writer=PillowWriter(fps=_FRAMES_PER_SECOND))
+    finally:
+        bar.close()
+        plt.close(figure)

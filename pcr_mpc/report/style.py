@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import matplotlib
+
+from ..files import picture_metadata, replacing
 
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-__all__ = ["BLUE", "GREEN", "GREY", "ORANGE", "PURPLE", "RED", "RODS", "SKY", "plt"]
+__all__ = ["BLUE", "GREEN", "GREY", "ORANGE", "PURPLE", "RED", "RODS", "SKY", "plt", "save_figure"]
 
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY, GREY = (
     "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#777777",
@@ -28,3 +33,13 @@ plt.rcParams.update(
         "lines.linewidth": 1.6,
     }
 )
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a picture, whole or not at all, with metadata by which it is known to be ours; and close it."""
+    path = Path(path)
+    try:
+        with replacing(path) as draft:
+            figure.savefig(draft, metadata=picture_metadata(path))
+    finally:
+        plt.close(figure)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from ..plant.equilibrium import Equilibrium
 from ..plant.stability import assess_stability
 from ..study.tuning_space import Search
@@ -20,9 +22,15 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(line).rstrip() for line in lines)
 
 
+def without_rounding(values: np.ndarray, scale: float) -> np.ndarray:
+    """Round to a billionth of a scale, so that what is zero but for rounding reads as zero, and never as -0."""
+    return np.asarray(np.where(np.abs(values) < 1e-9 * scale, 0.0, values))
+
+
 def summary_table(summary: dict[str, Any]) -> str:
-    """Figures of a run."""
+    """Figures of a run; first of all what is wrong with it."""
     lines = [
+        *([f"FAILED      {summary['verdict']}", ""] if summary["verdict"] else []),
         f"scene       {summary['scene']} ({summary['duration_s']:g} s)",
         f"controller  {summary['controller']}",
         f"plant       {summary['plant']}",
@@ -56,11 +64,15 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"inside the solver {_percent(summary['solver_share'])} of the control steps' time",
         f"QP iterations     p50 {iterations['p50']}, max {iterations['max']}",
         f"peak torque       {summary['peak_torque_Nm']:.3f} N m (limit {summary['torque_limit_Nm']:g}, soft)",
+        f"poses beyond      {_counts({k: v for k, v in summary['pose_violations'].items() if v})}",
         f"limits active in  {_counts(summary['active_limits'])} of {summary['control_steps']} periods",
         f"largest slack     {', '.join(f'{k} {v:.3g}' for k, v in summary['slack'].items()) or 'none'}",
         f"limit violations  {summary['limit_violations']}",
         f"fall-backs        {summary['fallbacks']}",
+        f"deadline misses   {summary['deadline_misses']}",
+        f"not believed      {summary['refused_measurements']} measurements",
         f"failures          {summary['failures']}",
+        *(f"warning           {event['message']}" for event in summary["events"] if event["kind"] == "warning"),
     ]
     return "\n".join(lines)
 
@@ -163,14 +175,15 @@ def equilibria_table(found: Sequence[Equilibrium]) -> str:
     rows = []
     for number, eq in enumerate(found, start=1):
         stability = assess_stability(eq)
+        (p_x, p_y), (f_x, f_y) = _position(eq), without_rounding(eq.force, eq.robot.force_scale)
         verdict = "stable" if stability.stable else f"{stability.unstable_directions} unstable"
         rows.append(
             (
                 f"{number} {eq.mode}",
                 verdict,
                 f"{eq.energy:.4f}",
-                f"({eq.p[0]:.4f}, {eq.p[1]:.4f})",
-                f"({eq.force[0]:.3f}, {eq.force[1]:.3f})",
+                f"({p_x:.4f}, {p_y:.4f})",
+                f"({f_x:.3f}, {f_y:.3f})",
                 " ".join(f"{margin:.2f}" for margin in stability.rod_margins),
                 f"{stability.stiffness_eigenvalues[0]:.4g}",
             )
@@ -179,19 +192,24 @@ def equilibria_table(found: Sequence[Equilibrium]) -> str:
     return table(header, rows)
 
 
+def _position(eq: Equilibrium) -> np.ndarray:
+    return without_rounding(eq.p, float(eq.robot.lengths.max()))
+
+
 def equilibrium_table(eq: Equilibrium) -> str:
     """Figures of an equilibrium."""
 
     def vector(values: Any) -> str:
         return "(" + ", ".join(f"{v:.6g}" for v in values) + ")"
 
+    length = float(eq.robot.lengths.max())
     rows = [
-        ("tip p [m]", vector(eq.p)),
+        ("tip p [m]", vector(_position(eq))),
         ("motor angles q [rad]", vector(eq.q)),
         ("working mode", eq.mode),
         ("verdict", "stable" if eq.stable else f"UNSTABLE (rods {list(eq.unstable_rods)})"),
-        ("force F = dU/dp [N]", vector(eq.force)),
-        ("motor torque dU/dq [N m]", vector(eq.motor_torque)),
+        ("force F = dU/dp [N]", vector(without_rounding(eq.force, eq.robot.force_scale))),
+        ("motor torque dU/dq [N m]", vector(without_rounding(eq.motor_torque, eq.robot.force_scale * length))),
         ("eigenvalues of K [N/m]", vector(eq.stiffness_eigenvalues)),
         ("energy U [J]", f"{eq.energy:.8g}"),
         (

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt
+from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt, save_figure
 from .tables import table
 
 _FIGURES = ("p50", "p95", "p99", "p99.9", "max")
@@ -90,14 +90,20 @@ def plot_timing(result: dict[str, Any], path: Path) -> None:
     load = f", load {machine['load']:.1f} to {machine['load_after']:.1f}" if machine["load"] is not None else ""
     figure.suptitle(f"{result['scene']}: step times on {machine['usable_cores']} cores of {machine['processor']}{load}")
     figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def _series(histogram: dict[str, Any]) -> list[tuple[str, str, str]]:
     colours = {"plant step": BLUE, "control step": ORANGE}
     return [(name, collector, colours[name]) for name in colours if name in histogram
             for collector in ("collector on", "collector off") if any(histogram[name][collector])]  # fmt: skip
+
+
+def _from(histogram: dict[str, Any]) -> float:
+    """Where the axis of times begins: at 3 us, or at the first bin that holds a step."""
+    edges = np.array(histogram["edges_us"])
+    used = [edges[:-1][np.array(histogram[name][collector]) > 0][0] for name, collector, _ in _series(histogram)]
+    return float(min([3.0, *used]))
 
 
 def _histogram(axis: Any, histogram: dict[str, Any]) -> None:
@@ -108,7 +114,7 @@ def _histogram(axis: Any, histogram: dict[str, Any]) -> None:
         axis.stairs(counts, edges, color=colour, label=f"{name}, {collector}", **style)
     axis.set(xscale="log", yscale="log", xlabel="wall time of a step [us]", ylabel="steps per bin")
     axis.set_ylim(0.8, None)
-    axis.set_xlim(3.0, None)
+    axis.set_xlim(_from(histogram), None)
     axis.set_title("Jitter")
     axis.legend(fontsize=8)
 
@@ -128,7 +134,7 @@ def _tail(axis: Any, histogram: dict[str, Any]) -> None:
             axis.axvline(1e6 / hz, color=colour, lw=1.0, ls="--")
             axis.text(1e6 / hz, 1.1, f"{hz} Hz", color=colour, rotation=90, fontsize=8, ha="right", va="top")
     axis.set(xscale="log", yscale="log", xlabel="wall time t [us]", ylabel="share of steps longer than t")
-    axis.set_xlim(3.0, max(2e4, 1.5 * last))
+    axis.set_xlim(_from(histogram), max(2e4, 1.5 * last))
     axis.set_title("Tail, and budgets (dashed)")
     axis.legend(fontsize=8, loc="lower left")
 

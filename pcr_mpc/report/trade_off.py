@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from .style import BLUE, GREEN, GREY, ORANGE, RED, plt
+from .style import BLUE, GREEN, GREY, ORANGE, RED, plt, save_figure
 
 
 def plot_trade_off(trials: list[dict[str, Any]], chosen: int | None, title: str, path: Path) -> None:
@@ -48,8 +48,7 @@ def plot_trade_off(trials: list[dict[str, Any]], chosen: int | None, title: str,
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
-    figure.savefig(path)
-    plt.close(figure)
+    save_figure(figure, path)
 
 
 def pareto(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from tqdm import tqdm
 
+from .. import interrupt
 from ..errors import NoRungError, PCRError, SimulationError
 from ..loop.controllers import Replay
 from ..loop.run import Run
@@ -117,6 +118,7 @@ class Bench:
         self.unavailable: list[tuple[PlantSettings, str]] = []
         x = np.concatenate([pose.p, scene.start_velocity, pose.q])
         for rung in all_physics(scene, dt):
+            interrupt.check()
             try:
                 plant = rung.make(scene.robot)
                 plant.reset(x, pose)
@@ -141,6 +143,7 @@ class Bench:
         try:
             run = self._simulate(rung, self._run.u)
         except SimulationError as error:
+            interrupt.pass_on(error)
             times = error.run.plant_time
             return Measured(rung, math.inf, float(np.median(times)) if len(times) else math.nan, str(error))
         measured = Measured(rung, math.nan, float(np.median(run.plant_time)), tips=run.x[:, :2])

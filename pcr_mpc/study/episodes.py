@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from .. import interrupt
 from ..control.tuning import Tuning
-from ..errors import SimulationError, checked_number
+from ..errors import SimulationError, checked_integer, checked_number
 from ..loop.feed_forward import InverseDynamics, feed_forward
 from ..loop.run import Run
 from ..loop.scene import Scene
@@ -143,7 +144,9 @@ class Spread:
 
     def sample(self, n_rods: int, seed: int) -> Mismatch:
         """Draw what is off in the episode of a seed; depends on nothing else."""
-        rng = np.random.default_rng([seed, 1])  # not the stream of the measurement noise, default_rng(seed)
+        rng = np.random.default_rng(
+            [checked_integer("seed", seed, minimum=0), 1]
+        )  # not the stream of the measurement noise, default_rng(seed)
         stiffness = 1.0 + self.stiffness * rng.uniform(-1.0, 1.0, n_rods)
         offsets = self.base_offset * rng.uniform(-1.0, 1.0, (n_rods, 2))
         direction, size = rng.uniform(0.0, 2 * math.pi), self.force * rng.uniform()
@@ -219,14 +222,14 @@ def run_episode(scene: Scene, tuning: Tuning, seed: int, spread: Spread = Spread
         steps whose CPU time exceeds the period, and ``episode_s``.
     """
     began = time.perf_counter()
+    seed = checked_integer("seed", seed, minimum=0)
     row: Row = {"seed": seed, **spread.sample(scene.robot.n_rods, seed).row(), "failure": ""}
     run: Run | None = None
     with _ONE_AT_A_TIME:
         try:
             run = simulate_episode(scene, tuning, seed, spread)
         except SimulationError as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):
-                raise KeyboardInterrupt from error
+            interrupt.pass_on(error)
             run, row["failure"] = error.run, str(error)
         except Exception as error:  # before the first step, as a reference that the believed robot cannot follow
             row["failure"] = f"{type(error).__name__}: {error}"

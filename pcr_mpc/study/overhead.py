@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import interrupt
 from ..buffered import BufferedFunction
 from ..errors import CompilerError
 from ..plant.dynamics import Plant
@@ -59,6 +60,7 @@ def call_overhead(robot: Robot, pose: Equilibrium) -> list[dict[str, Any]]:
         inputs = np.zeros((_ROLLED, robot.n_rods))
         spent = []
         for _ in range(_ROLLOUTS):
+            interrupt.check()
             began = time.thread_time()
             rollout(plant, x, inputs, guess=pose)
             spent.append(time.thread_time() - began)
@@ -74,6 +76,7 @@ def _fastest(call: Callable[[], Any]) -> float:
     """CPU time of a call [us], by batches, so that the clock does not count."""
     best = math.inf
     for _ in range(_BATCHES):
+        interrupt.check()
         began = time.thread_time()
         for _ in range(_CALLS):
             call()

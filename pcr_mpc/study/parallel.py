@@ -7,20 +7,26 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+from .. import interrupt
 from ..errors import StudyError
+from ..files import write_text
 from .provenance import differences
 
 Row = dict[str, Any]
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
+_PATIENCE = 2.0  # s
+_LISTEN = 0.1  # s, between looks at whether to stop while others work
 # Libraries that spread over all cores would fight for those of the other workers.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -36,8 +42,23 @@ def local_workers(jobs: int | None = None) -> Iterator[ProcessPoolExecutor]:
     try:
         # Not forked: a fork of a process with threads may hang.
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_follow_the_parent) as executor:
+        resource_tracker.ensure_running()  # which, when it is started, lets signals through
+        others = set(multiprocessing.active_children())
+        executor = _Workers(jobs, mp_context=context, initializer=_follow_the_parent)
+        try:
             yield executor
+        except BaseException:
+            # What the workers are at is of no more use; finished rows are with the caller.
+            executor.shutdown(wait=False, cancel_futures=True)
+            # Until its thread has put away what was cancelled, it would fail on that loudly.
+            patience = time.monotonic() + _PATIENCE
+            while getattr(executor, "_cancel_pending_futures", False) and time.monotonic() < patience:
+                time.sleep(0.01)
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()
+            raise
+        finally:
+            executor.shutdown()
     finally:
         for name, value in before.items():
             if value is None:
@@ -51,8 +72,16 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class _Workers(ProcessPoolExecutor):
+    """Workers that Ctrl-C in a terminal, which reaches all processes, does not stop: the parent does."""
+
+    def submit(self, *arguments: Any, **keywords: Any) -> Any:
+        """See `Executor`; this is where processes are started."""
+        with interrupt.held_back():
+            return super().submit(*arguments, **keywords)
+
+
 def _follow_the_parent() -> None:
-    # Ctrl-C in a terminal reaches all; a worker brings its task to its end, and the parent begins no other.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # A parent that is killed leaves its workers waiting for ever.
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
@@ -63,6 +92,15 @@ def _end_with_the_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+def as_finished(futures: Iterable[Future[Result]]) -> Iterator[Future[Result]]:
+    """Futures as they are finished, and an ear for Ctrl-C while there is none."""
+    left = set(futures)
+    while left:
+        interrupt.check()
+        done, left = wait(left, timeout=_LISTEN, return_when=FIRST_COMPLETED)
+        yield from done
 
 
 def finished(
@@ -104,7 +142,7 @@ def finished(
                 futures[executor.submit(task, argument)] = argument
             except BrokenExecutor as error:
                 lost.append((argument, error))
-        bar = tqdm(as_completed(futures), desc=desc, unit=unit, initial=before, total=before + len(futures),
+        bar = tqdm(as_finished(futures), desc=desc, unit=unit, initial=before, total=before + len(futures),
                    disable=not progress)  # fmt: skip
         for future in bar:
             try:
@@ -181,7 +219,7 @@ def _rows_so_far(path: Path, settings: dict[str, Any]) -> dict[int, Row]:
     lines = whole.splitlines()
     if not lines:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"settings": settings}) + "\n", encoding="utf-8")
+        write_text(path, json.dumps({"settings": settings}) + "\n")
         return {}
     try:
         header, *rows = map(json.loads, lines)
@@ -198,5 +236,5 @@ def _rows_so_far(path: Path, settings: dict[str, Any]) -> dict[int, Row]:
             differences=changed,
         )
     if len(whole) < len(text):
-        path.write_text(whole, encoding="utf-8")
+        write_text(path, whole)
     return found

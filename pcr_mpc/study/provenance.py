@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import subprocess
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from ..control.tuning import Tuning
+from ..loop.finding import own_motion
 from ..loop.scene import Scene
+from ..plain import plain
 from .episodes import Spread
 
 _PACKAGE = Path(__file__).parent.parent
@@ -20,12 +21,11 @@ _PACKAGE = Path(__file__).parent.parent
 def described(scene: Scene, tuning: Tuning, spread: Spread) -> dict[str, Any]:
     """Everything that decides what an episode of a given seed does, ready for JSON."""
     scene = scene.tuned(tuning)
-    record = {
-        "scene": {**asdict(scene), "reference": type(scene.trajectory).__name__},
-        "spread": asdict(spread),
-    }
-    # Tuples come back from JSON as lists: what is compared must have been there, too.
-    return dict(json.loads(json.dumps(record)))
+    reference: dict[str, Any] = {"reference": type(scene.trajectory).__name__}
+    if own := own_motion(scene):
+        reference["trajectory"] = own
+    # What is compared must have been through JSON, too.
+    return dict(json.loads(json.dumps({"scene": plain(scene) | reference, "spread": plain(spread)})))
 
 
 def differences(old: Any, new: Any, name: str = "") -> list[str]:

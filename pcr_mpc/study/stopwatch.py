@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from .. import interrupt
+
 # Calls that are reported apart and belong to no percentile: caches fill, branches are learnt, memory is mapped.
 WARM_UP = 20
 # The collector is on and off in turns, so that whatever else goes on on the machine meets both alike.
@@ -102,6 +104,7 @@ def measure(
             if k % _BLOCK == 0:
                 gc.collect()
                 (gc.disable if k // _BLOCK % 2 else gc.enable)()
+            interrupt.check()
             before(k)
             inside = True
             spent, start = processor(), clock()

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from .. import interrupt
 from ..loop.feed_forward import feed_forward
 from ..loop.run import Run
 from ..loop.scene import Scene
 from ..loop.simulate import simulate
 from ..loop.tracking import TrackingController, make_controller
+from ..methods import METHODS
 from ..plant.dynamics import DERIVATIVE_ACCURACY, Plant
-from ..plant.statics import METHODS
 from .machine import machine, versions
 from .overhead import call_overhead
 from .stopwatch import WARM_UP, Times, distribution, measure
@@ -149,6 +150,7 @@ def _force_error(plant: Plant, scene: Scene, run: Run) -> float:
     exact.reset(run.x[0], run.pose)
     plant.reset(run.x[0], run.pose)
     for x in run.x[:: run.steps_per_period][:200]:
+        interrupt.check()
         eq = exact.equilibrium(x)
         error = np.linalg.norm(plant.force(x[:2], x[4:]) - eq.force)
         worst = max(worst, float(error / np.linalg.norm(eq.rod_forces)))

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, StudyError
+from ..files import replacing, require_free, stamped
 from ..loop.scene import Scene, load_scene
+from ..toml_table import read_toml
 
 
 def default_path(scene_file: Path, name: str) -> Path:
     """Where the tuning of a scene belongs: beside the one that its file names."""
-    own = tomllib.loads(scene_file.read_text(encoding="utf-8"))["control"]["tuning"]
+    own = read_toml(scene_file).table("control").text("tuning")
     return Path(os.path.normpath(scene_file.parent / own)).with_name(f"{name}.toml")
 
 
@@ -23,30 +24,45 @@ def to_tune(scene_file: Path, start: Path | None = None) -> tuple[Scene, Tuning 
 
     By default that is the scene's own tuning. One that bears the scene's name is from an earlier search: then it is
     default.toml beside it, as it was for that search, and what was found is there to be found again.
+
+    Raises
+    ------
+    ModelError
+        The scene has nothing to track, or there is no default.toml to start from.
     """
     scene, known = load_scene(scene_file), None
+    if scene.trajectory is None:
+        raise ModelError(
+            f"{scene_file}: scene {scene.name} has nothing to track, and so no controller to tune; give it a reference",
+            file=str(scene_file),
+            key="reference.kind",
+        )
     if scene.tuning is not None and scene.tuning.name == scene.name:
-        known, start = scene.tuning, start or default_path(scene_file, "default")
+        known = scene.tuning
+        if start is None and not (start := default_path(scene_file, "default")).is_file():
+            raise ModelError(
+                f"{start}: no such file; the tuning of scene {scene.name} is from an earlier search, which started "
+                "from there: name the tuning to start from with --start",
+                file=str(start),
+            )
     return (scene.tuned(load_tuning(start)) if start else scene), known
 
 
-def write_tuning(tuning: Tuning, path: Path, comments: Sequence[str]) -> None:
+def write_tuning(tuning: Tuning, path: Path, comments: Sequence[str], *, force: bool = False) -> None:
     """Write a tuning of the linear MPC that reads back as it is, under some lines of comment.
 
     Raises
     ------
     StudyError
         It does not read back as it is; nothing is written.
+    OutputError
+        There is a file that was not written here, or was changed since, and ``force`` is not given.
     """
-    draft = path.with_name(f".{path.name}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        draft.write_text(_toml(tuning, comments), encoding="utf-8")
+    require_free(path, force=force)
+    with replacing(path) as draft:
+        draft.write_text(stamped(_toml(tuning, comments)), encoding="utf-8")
         if not _reads_back(draft, tuning):
             raise StudyError(f"{path}: tuning {tuning} has settings that this version cannot write", path=str(path))
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _reads_back(path: Path, tuning: Tuning) -> bool:

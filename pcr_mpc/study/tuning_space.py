@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..control.tuning import LINEARISE, Tuning
 from ..errors import PCRError
 from ..loop.scene import Scene
+from ..loop.scene_checks import is_multiple
 from .episodes import Spread
 
 if TYPE_CHECKING:
@@ -170,10 +171,12 @@ def candidate(search: Search, params: dict[str, Any]) -> Tuning:
 
 
 def _periods(search: Search) -> list[float]:
-    """Control periods that the plant's step divides; a known delay and a deadline are those of one period only."""
+    """Control periods that fit step and duration; a known delay and a deadline are those of one period only."""
     scene = search.scene
     if search.keep_period or scene.delay or math.isfinite(scene.deadline):
         return [scene.period]
-    ratios = {period: period / scene.plant.dt for period in {*PERIODS, scene.period}}
-    fitting = [period for period, r in ratios.items() if r > 0.5 and abs(r - round(r)) <= 1e-9 * r]
-    return sorted(period for period in fitting if scene.duration >= period)
+    return sorted(
+        period
+        for period in {*PERIODS, scene.period}
+        if is_multiple(period, scene.plant.dt) and is_multiple(scene.duration, period)
+    )

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from ..control.tuning import Tuning
 from ..errors import PCRError, StudyError
-from .parallel import finished
+from .parallel import as_finished, finished
 from .provenance import described, differences
 from .tuning_score import Costs, measure, score
 from .tuning_space import Search, candidate, guesses, parameters, space
@@ -78,12 +78,12 @@ def tune(search: Search, trials: int, executor: Executor, *, progress: bool = Tr
     study = _prepare(search, executor, progress)
     try:
         _run(study, search, trials, executor, progress)
+        return _confirm(search, executor, progress)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted; {len(finished_trials(search))} trials are kept in {search.storage}, "
             "and the same command adds to them"
         ) from None
-    return _confirm(search, executor, progress)
 
 
 def finished_trials(search: Search) -> list[dict[str, Any]]:
@@ -155,7 +155,8 @@ def _run(study: Study, search: Search, trials: int, executor: Executor, progress
         for number in bar:
             while len(pending) < min(_AHEAD, trials - number):
                 ask()
-            pending[0][1].exception()  # wait while it is still on the list
+            for _ in as_finished([pending[0][1]]):  # wait while it is still on the list
+                pass
             tell(*pending.popleft())
     except BrokenExecutor as error:
         lost.append((len(study.trials) - 1, error))

@@ -1,0 +1,148 @@
+"""What the command line understands; loads nothing that takes time."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+from .methods import METHODS
+
+_EXAMPLES = """\
+examples:
+  pcr-mpc track models/scenes/lemniscate.toml            closed loop, pictures and a table
+  pcr-mpc track models/scenes/limited.toml --json        the same figures for a machine
+  pcr-mpc statics models/planar_pair.toml --p 0 0.25 --mode LR     motor angles that hold the tip there
+  pcr-mpc statics models/rfrfr.toml --q 120 60 --degrees           where the free tip comes to rest
+  pcr-mpc statics models/planar_pair.toml --p 0.18 0.12 --equilibria   what else it could snap to
+  pcr-mpc track models/scenes/lemniscate.toml --plant mujoco       against another engine's robot
+  pcr-mpc export models/planar_pair.toml --p 0 0.25 --mode LR --out pair.xml     that robot as MJCF
+  pcr-mpc choose models/scenes/vertical.toml             what physics the scene needs, and why
+  pcr-mpc timing models/scenes/lemniscate.toml           step times against the real-time budgets
+  pcr-mpc tune models/scenes/pick_and_place.toml --trials 20 --jobs 2 --out better.toml     a better controller
+"""
+
+LINKS = 40
+# Least values of the options that are whole numbers.
+LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1}
+
+
+class _Version(argparse.Action):
+    """Looks the version up only where it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from importlib.metadata import version
+
+        print(f"pcr-mpc {version('pcr_mpc')}")
+        parser.exit()
+
+
+def parser() -> argparse.ArgumentParser:
+    """Build the parser; ``run`` of what it parses is module and function, so that only what is needed is loaded."""
+    top = argparse.ArgumentParser(
+        prog="pcr-mpc",
+        description="Model-predictive control of planar parallel continuum robots.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, module: str, run: str, text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        # Python 3.14's pattern; before, argparse takes -1e-2 for an option.
+        sub._negative_number_matcher = re.compile(r"-\.?\d")
+        sub.set_defaults(run=(module, run))
+        sub.add_argument("--json", action="store_true", help="print one JSON object on stdout instead of tables")
+        sub.add_argument("--traceback", action="store_true", help="show the traceback of a failure")
+        # The force of `statics` is one in newtons.
+        flags = ("--overwrite",) if name == "statics" else ("--force", "--overwrite")
+        if name != "choose":
+            sub.add_argument(*flags, dest="overwrite", action="store_true",
+                             help="overwrite files that pcr-mpc did not write, or that were changed since")  # fmt: skip
+        return sub
+
+    track = command(
+        "track", "cli_track", "track", "Run a scene in closed loop; write its record, a picture and an animation."
+    )
+    track.add_argument("scene", type=Path, help="scene file, such as models/scenes/lemniscate.toml")
+    track.add_argument("--controller", type=Path, help="controller tuning instead of the scene's own")
+    track.add_argument("--method", choices=METHODS, help="statics of the plant instead of the scene's own")
+    track.add_argument("--plant", choices=("mujoco",), help="simulate the robot with MuJoCo instead (extra 'mujoco')")
+    track.add_argument("--links", type=int, help="of each rod, with --plant mujoco (default 40)")
+    track.add_argument("--seed", type=int, default=0, help="of the measurement noise (default 0)")
+    track.add_argument("--out", type=Path, help="folder for the results (default results/NAME)")
+    track.add_argument("--no-pictures", action="store_true", help="write the record only")
+
+    statics = command(
+        "statics",
+        "cli_statics",
+        "solve_pose",
+        "Solve a pose: give --p and --q, or one of them to find the other in balance with --force.",
+    )
+    statics.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
+    statics.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), help="tip position [m]")
+    statics.add_argument("--q", type=float, nargs="+", metavar="A", help="motor angles [rad]")
+    statics.add_argument("--degrees", action="store_true", help="motor angles are given in degrees")
+    statics.add_argument("--force", type=float, nargs=2, metavar=("FX", "FY"),
+                         help="external force on the tip [N], where p or q is to be found (default 0 0)")  # fmt: skip
+    statics.add_argument("--mode", help="working mode to look for, a letter L or R per rod, such as LR")
+    statics.add_argument("--method", choices=METHODS, help="where both p and q are given (default closed_form)")
+    statics.add_argument(
+        "--equilibria",
+        action="store_true",
+        help="list every equilibrium, with its verdict: with --p and --q of the held tip, with --q of the free one, "
+        "with --p of the held tip at the motor angles that balance it",
+    )
+    statics.add_argument("--picture", type=Path, metavar="FILE", help="draw the pose into FILE")
+
+    mjcf = command("export", "cli_statics", "export", "Write a robot in balance as a model file of MuJoCo (MJCF).")
+    mjcf.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
+    mjcf.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), required=True, help="tip position [m]")
+    mjcf.add_argument("--mode", help="working mode, a letter L or R per rod, such as LR")
+    mjcf.add_argument("--links", type=int, default=LINKS, help=f"of each rod (default {LINKS})")
+    mjcf.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file, such as planar_pair.xml")
+
+    choice = command(
+        "choose",
+        "cli_study",
+        "choose_rung",
+        "Find the lowest physics and the cheapest discretisation that meet what a scene's [need] table asks for.",
+    )
+    choice.add_argument("scene", type=Path, help="scene file, such as models/scenes/vertical.toml")
+    choice.add_argument("--write", action="store_true", help="put the chosen rung into the scene's [plant] table")
+
+    timing = command(
+        "timing",
+        "cli_study",
+        "time_loop",
+        "Time plant steps of every method and the control step against their budgets; draw it.",
+    )
+    timing.add_argument("scene", type=Path, help="scene file")
+    timing.add_argument("--steps", type=int, default=100_000,
+                        help="plant steps and control steps (default 100000: two or three minutes)")  # fmt: skip
+    timing.add_argument("--out", type=Path, help="folder for the results (default results/timing/NAME)")
+
+    tuning = command(
+        "tune",
+        "cli_study",
+        "tune_controller",
+        "Search for a better tuning of a scene's linear MPC, with Optuna; write it if there is one. "
+        "A study goes on where the last call with the same settings ended.",
+    )
+    tuning.add_argument("scene", type=Path, help="scene file")
+    tuning.add_argument("--start", type=Path, metavar="FILE", help="tuning to beat (default: the scene's; default.toml "
+                        "beside it if that is from an earlier search)")  # fmt: skip
+    tuning.add_argument("--trials", type=int, default=50, help="to add to the study (default 50)")
+    tuning.add_argument("--jobs", type=int, default=1, help="processes on this machine (default 1)")
+    tuning.add_argument("--storage", metavar="URL", help="Optuna storage, for several machines "
+                      "(default SQLite in results/tune/SCENE)")  # fmt: skip
+    tuning.add_argument("--episodes", type=int, default=24, help="with mismatch, in each trial (default 24: a "
+                        "study that sees no failure, which is rare, takes a fragile tuning for the best)")  # fmt: skip
+    tuning.add_argument("--keep-period", action="store_true", help="the control period is given: search the rest")
+    tuning.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
+    tuning.add_argument(
+        "--out", type=Path, metavar="FILE", help="tuning to write (default SCENE.toml beside the scene's)"
+    )
+    return top

@@ -1,0 +1,95 @@
+"""The command of the command line that runs a scene."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from . import interrupt
+from .cli_parser import LINKS
+from .control.tuning import load_tuning
+from .errors import OutputError, PCRError, SimulationError
+from .files import require_folder, results, saved
+from .loop.model_inertia import by_model_inertia
+from .loop.run import RECORD, Run
+from .loop.scene import load_scene
+from .loop.simulate import simulate
+from .loop.simulated_plant import SimulatedPlant
+from .loop.tracking import make_controller
+from .plant.mujoco_plant import MuJoCoPlant
+from .report.tables import summary_table
+
+_PICTURES = ("track.png", "track.gif")
+
+
+def track(options: argparse.Namespace) -> int:
+    """Run `pcr-mpc track`."""
+    scene = load_scene(options.scene)
+    tuning = load_tuning(options.controller) if options.controller else None
+    if tuning and scene.trajectory is None:
+        raise ValueError(f"scene {scene.name} has nothing to track, so --controller has no use")
+    if tuning:
+        scene = scene.tuned(tuning)
+    if options.plant and options.method:
+        raise ValueError("--method has no use with --plant: MuJoCo solves no statics")
+    if options.links is not None and not options.plant:
+        raise ValueError("--links goes with --plant mujoco")
+    plant: SimulatedPlant = scene.make_plant()
+    if options.plant:
+        plant = MuJoCoPlant(scene.robot, links=LINKS if options.links is None else options.links, dt=scene.plant.dt)
+    elif options.method:
+        scene = replace(scene, plant=replace(scene.plant, method=options.method))
+        plant = scene.make_plant()
+    folder = options.out or Path("results") / scene.name
+    # Rather now than after the run.
+    require_folder(folder, RECORD if options.no_pictures else (*RECORD, *_PICTURES), force=options.overwrite)
+    failure: SimulationError | None = None
+    try:
+        run = simulate(scene, plant, make_controller(scene, tuning), options.seed, progress=True)
+    except SimulationError as error:
+        failure, run = error, error.run
+    folder, problem = saved(partial(run.save, force=options.overwrite), folder)
+    summary = run.summary()
+    used = tuning or scene.tuning
+    if options.plant and used is not None and failure is None:
+        summary["by_model_inertia"] = by_model_inertia(run, used, plant, progress=True)
+    # Of a run that was interrupted the record is enough: who presses Ctrl-C wants no pictures.
+    pictures = not (options.no_pictures or interrupt.noted())
+    folder, second = saved(partial(_complete, run, summary, pictures), folder)
+    print(json.dumps(summary) if options.json else f"\n{summary_table(summary)}\n\nwritten to {folder}")
+    if failure is not None:
+        raise failure
+    if run.verdict():
+        raise SimulationError(f"{scene.name}: {run.verdict()}", run=run)
+    if problem or second:
+        raise OutputError(problem or second, path=str(folder))
+    return 0
+
+
+def _complete(run: Run, summary: dict[str, Any], pictures: bool, folder: Path) -> None:
+    """Add the pictures, and to the summary where everything is."""
+    with results(folder, keep=RECORD) as staged:
+        drawn = _PICTURES if pictures and _drawn(run, staged) else ()
+        summary["files"] = {name: str(folder / name) for name in (*RECORD, *drawn)}
+        (staged / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _drawn(run: Run, folder: Path) -> bool:
+    """Draw a run; what cannot be drawn, as a robot that was lost, is said and no reason to lose the figures."""
+    from .report.plots import animate_run, plot_run  # which load Matplotlib
+
+    picture, animation = (folder / name for name in _PICTURES)
+    try:
+        plot_run(run, picture)
+        animate_run(run, animation, progress=True)
+    except (PCRError, ValueError) as error:
+        for path in (picture, animation):
+            path.unlink(missing_ok=True)
+        print(f"pcr-mpc: no pictures: {error}", file=sys.stderr)
+        return False
+    return True
