@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from pcr_mpc import HoldMotors, cli, load_scene, load_tuning, simulate
+from pcr_mpc import HoldMotors, cli_study, load_scene, load_tuning, simulate
 from pcr_mpc.cli import main
 from pcr_mpc.plant.stability import assess_stability
 from pcr_mpc.report.choice_tables import choice_record, choice_table
@@ -251,8 +251,8 @@ def test_options_that_do_not_go_together_are_named(arguments, message, capsys, t
 def test_tune_takes_storage_seed_period_and_episodes_from_its_options(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     searches = []
-    monkeypatch.setattr(cli, "tune", lambda search, trials, executor, **_: searches.append((search, trials)))
-    monkeypatch.setattr(cli, "finished_trials", lambda _: [{"trial": 0, "score": 1.0, **asdict(
+    monkeypatch.setattr(cli_study, "tune", lambda search, trials, executor, **_: searches.append((search, trials)))
+    monkeypatch.setattr(cli_study, "finished_trials", lambda _: [{"trial": 0, "score": 1.0, **asdict(
         Costs(1.0, 0.1, 10.0, 100.0, 1.0, 0.0, 0.0))}])  # fmt: skip
     scene = str(SCENES / "lemniscate.toml")
     assert main(["tune", scene, "--storage", "sqlite:///x.db", "--keep-period", "--seed", "5", "--episodes", "3",
@@ -273,18 +273,18 @@ def test_an_interrupt_has_its_own_status(words, said, monkeypatch, capsys):
     def interrupted(options):
         raise KeyboardInterrupt(*words)
 
-    monkeypatch.setattr(cli, "_choose", interrupted)
-    assert main(["choose", "a.toml"]) == 130
+    monkeypatch.setattr(cli_study, "choose", interrupted)
+    assert main(["choose", str(SCENES / "vertical.toml")]) == 130
     assert capsys.readouterr().err == f"pcr-mpc: {said}\n"
 
 
 def test_seeds_reach_the_noise(tmp_path, capsys, monkeypatch):
     """Another seed, another run; the record says which."""
     scene = replace(load_scene(SCENES / "sensors.toml"), duration=0.05)
-    monkeypatch.setattr(cli, "load_scene", lambda path: scene)
+    monkeypatch.setattr("pcr_mpc.cli_track.load_scene", lambda path: scene)
     hashes = []
     for seed in ("3", "4"):
-        assert main(["track", "x.toml", "--seed", seed, "--out", str(tmp_path / seed), "--no-pictures", "--json"]) == 0
+        assert main(["track", str(SCENES / "sensors.toml"), "--seed", seed, "--out", str(tmp_path / seed), "--no-pictures", "--json"]) == 0
         summary = json.loads(capsys.readouterr().out)
         assert summary["seed"] == int(seed)
         hashes.append(summary["run_hash"])

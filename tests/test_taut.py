@@ -1,5 +1,7 @@
 """Rods pulled nearly straight: cold starts and warm ones, against mpmath, the separatrix and the energy."""
 
+from dataclasses import replace
+
 import casadi as ca
 import mpmath
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from pcr_mpc import ConvergenceError, UnstableError, forward_statics, solve_statics
+from pcr_mpc import ConvergenceError, Plant, UnstableError, forward_statics, solve_statics
 from pcr_mpc.plant import elastica
 from pcr_mpc.plant.chart import critical_load
 
@@ -177,3 +179,18 @@ def test_guess_without_a_load(pair, centre):
     """Nodes of straight rods that carry nothing: a bad guess, and no arithmetic error."""
     with pytest.raises(ConvergenceError):
         solve_statics(pair, where_slacks_are(pair, (1e-4, 2e-4)), (3.1, 0.0), guess=np.zeros((2, 4, 8)))
+
+
+def test_condensed_weight_of_taut_rods(pair):
+    """What the weight adds to F goes to a limit as the rods are drawn straight, also where k' is no number."""
+    laden, added = replace(pair, gravity=(0.0, -9.81)), []
+    for pull in (1e5, 2e5, 9e5):
+        phi = np.array([-0.3, 0.3])
+        p = where_slacks_are(pair, 4 * np.sin(phi / 4) ** 2 / np.sqrt(pull))
+        q = np.arctan2(*(p - pair.bases).T[::-1]) - phi
+        pose = solve_statics(pair, p, q)
+        plant = Plant(laden, weight="condensed")
+        plant.reset(np.concatenate([p, [0.0, 0.0], q]), pose)
+        added.append(plant.force(p, q) - pose.force)
+    assert added[1] == pytest.approx(added[0], rel=0.01, abs=1e-5)
+    assert added[2] == pytest.approx(added[0], rel=0.03, abs=1e-5)

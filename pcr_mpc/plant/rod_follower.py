@@ -25,8 +25,8 @@ BRANCH_CHANGE = 0.3
 # A rod that can be followed no further with less than this left to lambda_c has come to a fold.
 _FOLD_MARGIN = 0.15
 _SMALLEST_SUBSTEP = 1.0 / 1024.0
-# Slack, in units of L, below which the smallest sub-step shrinks with it, as what changes a rod does; the least.
-_STRAIGHT, _STRAIGHTEST = 0.01, 1e-8
+# Slacks, in units of L, between which the smallest sub-step shrinks with it, as what changes a rod does.
+_STRAIGHTEST, _STRAIGHT = 1e-9, 0.01
 _SNAP_NODES = 64
 # A cold start of a rod that is not plain begins at a tip no further from its base than this, in units of L.
 _WELL_BENT = 0.9
@@ -151,8 +151,8 @@ class RodFollower:
                 raise
             first = failure
         # Continuation along the straight line from the last pose, sub-steps halved and doubled as they go.
-        slack = max(_STRAIGHTEST, 1.0 - max(math.hypot(*start.pose[:2]), math.hypot(*pose[:2])))
-        smallest = _SMALLEST_SUBSTEP * min(1.0, slack / _STRAIGHT)
+        slack = 1.0 - max(math.hypot(*start.pose[:2]), math.hypot(*pose[:2]))
+        smallest = _SMALLEST_SUBSTEP * (slack / _STRAIGHT if _STRAIGHTEST <= slack < _STRAIGHT else 1.0)
         state, done, substep, crossed = start, 0.0, 0.5, False
         while done < 1.0:
             target = 1.0 if done + substep >= 1.0 else done + substep

@@ -84,7 +84,7 @@ def _rod_weight() -> tuple[Any, Any]:
     unknowns, angle, down = ca.SX.sym("unknowns", 3), ca.SX.sym("angle"), ca.SX.sym("down", 2)
     moving, hand, pose = unknowns[:2], unknowns[2], ca.SX.sym("pose", 3)
     load = unknowns[1]
-    delta, rate, c = pendulum(unknowns[0], load)
+    delta, rate, c = pendulum(unknowns[0], load, any_pull=True)
     cos, sin = ca.cos(delta), ca.sin(delta)
 
     def seen_from_clamp(along: Any, across: Any) -> Any:
@@ -92,7 +92,7 @@ def _rod_weight() -> tuple[Any, Any]:
 
     mean = ca.SX(2, 1)
     for x, weight in zip(*np.polynomial.legendre.leggauss(_POINTS), strict=True):
-        _, rate_there, c_there = pendulum(unknowns[0], load * (1 - x) / 2)
+        _, rate_there, c_there = pendulum(unknowns[0], load * (1 - x) / 2, any_pull=True)
         mean += weight / 2 * seen_from_clamp(c - c_there, rate - rate_there)
     turn = ca.vertcat(
         ca.horzcat(ca.cos(pose[2]), ca.sin(pose[2])), hand * ca.horzcat(-ca.sin(pose[2]), ca.cos(pose[2]))
