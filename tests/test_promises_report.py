@@ -284,7 +284,21 @@ def test_seeds_reach_the_noise(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pcr_mpc.cli_track.load_scene", lambda path: scene)
     hashes = []
     for seed in ("3", "4"):
-        assert main(["track", str(SCENES / "sensors.toml"), "--seed", seed, "--out", str(tmp_path / seed), "--no-pictures", "--json"]) == 0
+        assert (
+            main(
+                [
+                    "track",
+                    str(SCENES / "sensors.toml"),
+                    "--seed",
+                    seed,
+                    "--out",
+                    str(tmp_path / seed),
+                    "--no-pictures",
+                    "--json",
+                ]
+            )
+            == 0
+        )
         summary = json.loads(capsys.readouterr().out)
         assert summary["seed"] == int(seed)
         hashes.append(summary["run_hash"])

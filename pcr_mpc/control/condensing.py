@@ -17,6 +17,11 @@ from ..buffered import graph_cache
 _UNROLLED = 12
 
 
+def _split(column: Any, ends: list[int]) -> list[Any]:
+    found: list[Any] = ca.vertsplit(column, ends)
+    return found
+
+
 class _Models:
     """Models of all periods, taken from their columns; the motors are exact integrators, which prunes the graph."""
 
@@ -28,7 +33,7 @@ class _Models:
         self.b: list[Any] = []
         self.c: list[Any] = []
         for k in range(1 if single else horizon):
-            a, c, b, _ = ca.vertsplit(packed[:, k], [*ends, packed.size1()])
+            a, c, b, _ = _split(packed[:, k], [*ends, packed.size1()])
             a, b = ca.reshape(a, n_states, n_states)[:4, :], ca.reshape(b, n_states, n)[:4, :]
             self.a.append(ca.vertcat(a, ca.horzcat(ca.DM(n, 4), ca.DM.eye(n))))
             self.b.append(ca.vertcat(b, dt * ca.DM.eye(n)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, overload
@@ -114,7 +115,7 @@ def column_size(n_states: int) -> int:
 
 def n_states(size: int) -> int:
     """States of a model whose column has ``size`` numbers."""
-    found = round((1 + (1 + 8 * size) ** 0.5) / 4)
+    found = (1 + math.isqrt(1 + 8 * size)) // 4
     if column_size(found) != size:
         raise ValueError(f"a column of {size} numbers holds no linear model")
     return found

@@ -110,9 +110,9 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
     shift, target_record, target_good = _shifted(target, given, force, n)
     states = given.states + ca.vertcat(ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon))
     outputs = {
-        "good": ca.vertcat(good.T, target_good), "corrected": corrected, "arriving": arriving,
-        "places": states_of,
-        "followed": records, "models": models, "moved_shift": shift, "followed_target": target_record, "wanted": states, "signs": _signs(model, given, records[:, places.delay]),
+        "good": ca.vertcat(good.T, target_good), "corrected": corrected, "arriving": arriving, "places": states_of,
+        "followed": records, "models": models, "signs": _signs(model, given, records[:, places.delay]),
+        "moved_shift": shift, "followed_target": target_record, "wanted": states,
     }  # fmt: skip
     if condense is not None:
         of_plan = models[:, places.delay :]
@@ -172,9 +172,11 @@ def _signs(model: StepModel, given: Any, record: Any) -> Any:
     """By what limits of a pose come near: see `LimitWatch.far`."""
     n, width = model.kind.n_rods, model.method.newton.size1_in(0)
     ends = [0, width * n, (4 * width + 3) * n, (4 * width + 6) * n, (4 * width + 15) * n, record.size1()]
-    unknowns, _, loads, slopes, _ = ca.vertsplit(record, ends)
+    parts: list[Any] = ca.vertsplit(record, ends)
+    unknowns, _, loads, slopes, _ = parts
     loads, slopes = ca.reshape(loads, 3, n), ca.reshape(slopes, 3, 3 * n)
-    torques, k = [], ca.MX(2, 2)
+    torques: list[Any] = []
+    k: Any = ca.MX(2, 2)
     for i, rod in enumerate(model.kind.unpack(given.numbers).rods):
         torques.append(-rod.bending_stiffness / rod.length * loads[2, i])
         k += rod.bending_stiffness / rod.length**3 * slopes[:2, 3 * i : 3 * i + 2]
