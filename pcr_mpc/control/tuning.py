@@ -22,7 +22,7 @@ LINEARISE = ("here", "along_plan")
 INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
 # Two sums of the same commands differ by rounding [rad].
-_SAME_ANGLE = 1e-9
+SAME_ANGLE = 1e-9
 # Matrices grow with the square of the horizon: at this one they are made in half a minute.
 LONGEST_HORIZON = 400
 
@@ -195,7 +195,7 @@ class Limits(Frozen):
         for now, before, at, lower, upper, also in each:
             if math.isfinite(at):
                 low, high = at, at
-                if abs(also - at) > _SAME_ANGLE:
+                if abs(also - at) > SAME_ANGLE:
                     low, high = min(at, also), max(at, also)
                 most = self._fastest((upper - high) / dt, (upper - low) / dt)
                 least = -self._fastest((low - lower) / dt, (high - lower) / dt)

@@ -163,7 +163,9 @@ class Check:
         graph = self._graph(len(models))
         _, _, _, y, p, q, lower, upper, bounds, _ = graph.inputs
         y[:], p[:], q[:], lower[:], upper[:] = solution.y, qp.P, qp.q, qp.l, qp.u
-        bounds[:] = motor_bounds(limits)
+        if limits is not self._limits:
+            self._limits, self._bounds = limits, motor_bounds(limits)
+        bounds[:] = self._bounds
         states = self.states(x, models, solution.x)
         primal, dual, excess = graph.outputs[1].tolist()
         return states, primal, dual, excess

@@ -74,6 +74,8 @@ class Foresight:
     ----------
     inputs : dict of str to ndarray
         Of the graph: what a caller writes before a call.
+    rows : dict of str to ndarray
+        Those of its inputs that have a column for each period or place: views with a row for each.
     corrected : ndarray, shape (6 + n,)
         State and force after the last measurement, also where the rods could not follow.
     """
@@ -95,6 +97,8 @@ class Foresight:
         self._graph = BufferedFunction(fastest(graph, compiled))
         self.inputs = dict(zip(graph.name_in(), self._graph.inputs, strict=True))
         self._outputs = dict(zip(graph.name_out(), self._graph.outputs, strict=True))
+        self.rows = {name: _rows(self.inputs[name]) for name in ("states", "inputs", "path", "on_the_way", "payloads")}
+        self._records, self._followed = _rows(self.inputs["records"]), _rows(self._outputs["followed"])
         self.inputs["dt"][:] = period
         self.inputs["target_numbers"][:] = target.numbers
         found, first = self._outputs, places.delay
@@ -107,7 +111,7 @@ class Foresight:
             models=LinearModels(columns[:, first:], period, force),
             record=_column(found["followed"], first),
             shift=found["moved_shift"],
-            states=found["wanted"].reshape(-1, places.horizon, order="F").T,
+            states=_rows(found["wanted"]),
             signs=found["signs"],
             qp=[found[name] for name in ("P", "q", "l", "u") if name in found],
         )
@@ -120,12 +124,11 @@ class Foresight:
         self.inputs["mass"][:] = self._plant.mass(x[:2], x[4:])[0]
         self.inputs["target"][:] = self._target_plant.record
         self.inputs["shift"][:] = 0.0
-        records = self.inputs["records"]
-        records.reshape(len(self._plant.record), -1, order="F")[:] = self._plant.record[:, None]
+        self._records[:] = self._plant.record
 
     def pose(self, x: np.ndarray) -> Equilibrium:
         """Equilibrium at the state x at which the next period will begin, following the branch."""
-        self._plant.recall(_column(self.inputs["records"], 0))
+        self._plant.recall(self._records[0])
         return self._plant.equilibrium(x)
 
     def target_from(self, other: Foresight) -> None:
@@ -145,26 +148,22 @@ class Foresight:
         if good.min() < 1.0:
             self._bring_along()
         inputs, found = self.inputs, self._outputs
-        size = len(self._plant.record)
         # In the next period each place is where its neighbour is now.
-        records, followed = (block.ravel(order="F") for block in (inputs["records"], found["followed"]))
-        records[:-size], records[-size:] = followed[size:], followed[-size:]
+        self._records[:-1], self._records[-1] = self._followed[1:], self._followed[-1]
         inputs["target"][:], inputs["shift"][:] = found["followed_target"], found["moved_shift"]
         return self._outlook
 
     def _bring_along(self) -> None:
         """Take the ladder for the rods that have not followed, one place after the other."""
         good, found = self._outputs["good"], self._outputs
-        records = self.inputs["records"].reshape(len(self._plant.record), -1, order="F")
-        places = found["places"].reshape(-1, self.places.count, order="F")
         payloads, force = self.inputs["payloads"].ravel(), found["corrected"][-2:]
         for j in range(self.places.count):
             if good[j] < 1.0:
-                self._plant.recall(records[:, j])
-                x = places[:, j].copy()
+                self._plant.recall(self._records[j])
+                x = found["places"].reshape(-1, self.places.count, order="F")[:, j].copy()
                 self._plant.carry(float(payloads[j]), x)
                 linearise(self._plant, x, np.zeros(len(x) - 4), self._period, force)
-                records[:, j] = self._plant.record
+                self._records[j] = self._plant.record
                 # What comes after stands on this place.
                 self._graph()
                 if good[j] < 1.0:
@@ -179,12 +178,17 @@ class Foresight:
     def _follow_target(self) -> None:
         """Take the ladder for the rods of the motor target; where it leads nowhere, they stay where they are."""
         inputs, plant = self.inputs, self._target_plant
-        end = inputs["states"].reshape(-1, self.places.horizon, order="F")[:, -1]
+        end = self.rows["states"][-1]
         plant.recall(inputs["target"])
         with suppress(PCRError):
             plant.force(end[:2], end[4:] + inputs["shift"])
             inputs["target"][:] = plant.record
             self._graph()
+
+
+def _rows(columns: np.ndarray) -> np.ndarray:
+    """View of a graph's columns as rows."""
+    return columns[None] if columns.ndim == 1 else columns.T
 
 
 def _column(block: np.ndarray, j: int) -> np.ndarray:

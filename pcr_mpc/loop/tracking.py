@@ -15,11 +15,11 @@ from ..control.nonlinear_mpc import NonlinearMPC
 from ..control.observer import DisturbanceObserver
 from ..control.plan import Plan
 from ..control.qp import QuadraticProgram, Reference, constraint_matrix, motor_bounds, stage_weights
-from ..control.tuning import Limits, Tuning
+from ..control.tuning import SAME_ANGLE, Limits, Tuning
 from ..errors import PCRError, checked_period, measured_vector
 from ..frozen import Remade, set_once
 from ..linearisation.linear_limits import LinearLimits
-from ..linearisation.linear_model import LinearModel
+from ..linearisation.linear_model import LinearModel, LinearModels
 from ..linearisation.linearise import linearise
 from ..linearisation.pose_limits import LimitWatch
 from ..plant.dynamics import Plant
@@ -112,7 +112,7 @@ class TrackingController(Remade):
         self._inverse.start(pose)
         self._gate.start(pose.q)
         self._reckoned = pose.q  # where the commands so far lead, whatever is measured
-        self._predicts, self._next = resting, x
+        self._predicts, self._next = LinearModels.of([resting]), x
         self._sent.extend([np.zeros(self.robot.n_rods)] * self._told.delay)
         self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
         self._u = np.zeros(self.robot.n_rods)
@@ -248,15 +248,17 @@ class TrackingController(Remade):
         given["estimate"][-2:] = 0.0 if observer is None else observer.force
         given["measured"][:2] = now[:2] if p is None else p
         given["measured"][2:] = now[4:] if q is None else q
+        rows = self._foresight.rows
         for j, u in enumerate(self._on_the_way):
-            given["on_the_way"].reshape(len(u), -1, order="F")[:, j] = u
+            rows["on_the_way"][j] = u
         given["u_previous"][:] = self._u
         reference, row = self._rows(k, k + self._delay)
-        given["states"][:] = _columns(reference.states[row + 1 : row + 1 + horizon], given["states"])
-        given["inputs"][:] = _columns(reference.inputs[row : row + horizon], given["inputs"])
+        rows["states"][:] = reference.states[row + 1 : row + 1 + horizon]
+        rows["inputs"][:] = reference.inputs[row : row + horizon]
         given["end_force"][:] = reference.forces[row + horizon]
         count = self._foresight.places.count
-        given["payloads"].ravel()[:] = self._payloads[np.minimum(np.arange(k, k + count), len(self._payloads) - 1)]
+        first = min(k, len(self._payloads) - count)
+        rows["payloads"][:, 0] = self._payloads[first : first + count]
         if self._foresight.places.models > 1:
             # The last plan, one period on; at the start, and beyond the end of a shorter plan, the reference.
             reference, row = self._rows(k, k + self._delay + 1)
@@ -264,7 +266,7 @@ class TrackingController(Remade):
             if self._plan is not None and self._plan.states is not None:
                 known = self._plan.states[2:]
                 path = known if len(known) == len(path) else np.concatenate([known[: len(path)], path[len(known) :]])
-            given["path"][:] = _columns(path, given["path"])
+            rows["path"][:] = path
 
     def _near(self, outlook: Outlook) -> LinearLimits | None:
         """Limits of the pose ahead that are near."""
@@ -303,21 +305,25 @@ class TrackingController(Remade):
     def _look_on(self, outlook: Outlook | None, plan: Plan, estimate: np.ndarray, arriving: np.ndarray) -> None:
         """Foresee the state at the next measurement."""
         if outlook is not None and self._delay:
-            expected = outlook.arriving.copy()
-            self._predicts = outlook.now[0]
+            self._predicts = outlook.now.copy()
+            self._next = outlook.arriving.copy()
         else:
             if outlook is not None:
                 # A plan may know better than the models that it was asked for with.
-                better = outlook.models if plan.models is None or plan.fallback else plan.models
-                self._predicts = better if isinstance(better, LinearModel) else better[0]
-            expected = self._predicts(estimate, arriving)
-        self._next = expected
+                better = outlook.models.copy() if plan.models is None or plan.fallback else plan.models
+                self._predicts = LinearModels.of([better] if isinstance(better, LinearModel) else better)
+            if plan.states is None or plan.fallback or self._delay:
+                self._next = self._predicts[0](estimate, arriving)
+            else:
+                self._next = plan.states[1].copy()
         if self.observer is not None:
-            self.observer.x = expected
+            self.observer.x = self._next
 
     def _within_stops(self, plan: Plan, ahead: np.ndarray) -> Plan:
         """The plan, its first rates within the stops for the sum of the commands too: a wrong angle may be measured."""
         first = plan.inputs[0]
+        if max(map(abs, (self._reckoned - ahead[4:]).tolist())) <= SAME_ANGLE:
+            return plan  # of one opinion, as the law was
         kept = self._limits.kept(first, self._u, ahead[4:], self._scene.period, self._reckoned)
         if kept.tolist() == first.tolist():
             return plan
@@ -347,7 +353,9 @@ class TrackingController(Remade):
     def _invert_dynamics(self, known: InverseDynamics | None) -> None:
         tail, inertia = self.tuning.horizon + self._delay, self.tuning.model.inertia
         self._reference = known or feed_forward(self._scene, self.robot, self._pose, tail, inertia)
-        self._payloads = self._scene.carried(self._scene.period * np.arange(self._scene.n_periods + tail))
+        # Longer than any place is ahead of the end.
+        times = self._scene.period * np.arange(self._scene.n_periods + 2 * tail)
+        self._payloads = self._scene.carried(times)
 
     def _rest(self) -> LinearModel:
         """Linear model about the start."""
@@ -410,11 +418,6 @@ class TrackingController(Remade):
         if tuning.law == "pd":
             return PD(tuning, limits, lambda p, q, force: q + self._inverse.shift(p, q, force))
         return FeedForward(tuning, limits)
-
-
-def _columns(rows: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """Rows as the columns of a graph's input."""
-    return rows.T.reshape(like.shape, order="F")
 
 
 def motor_limits(robot: Robot, period: float) -> Limits:
