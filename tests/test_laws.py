@@ -9,7 +9,6 @@ from pcr_mpc import Plant, inverse_statics, linearise, load_scene, load_tuning, 
 from pcr_mpc.control.laws import LQR, PD, FeedForward
 from pcr_mpc.control.qp import Reference
 from pcr_mpc.control.tuning import Limits
-from pcr_mpc.loop.along_plan import AlongPlan
 
 from .conftest import CONTROLLERS, MODELS
 
@@ -113,31 +112,6 @@ def test_limits_of_the_one_step_laws_are_named(at_rest, pair):
         plan = law.solve(x, model, Reference(x[None], np.array([wanted])), np.zeros(2))
         assert plan.active == active
     assert plan.inputs[0] == pytest.approx([-1.0, 0.0])
-
-
-def test_models_along_the_plan_are_those_of_fresh_linearisations(pair, centre):
-    """Moving on and renewing where needed must give what linearising everywhere gives, forces included."""
-    rng = np.random.default_rng(5)
-    x = np.concatenate([centre.p, [0.1, -0.2], centre.q])
-    along = AlongPlan([Plant(pair) for _ in range(4)], DT)
-    along.reset(x, centre)
-    force, path = np.zeros(2), x + np.outer(np.arange(1, 5), [2e-3, 1e-3, 0, 0, 5e-3, -5e-3])
-    for step in range(6):
-        payloads = np.where(step + np.arange(4) >= 5, 0.1, 0.0)  # picked up on the way
-        found = along.models(path, np.zeros(2), force, payloads)
-        for at, model, payload in zip(path, found, payloads, strict=True):
-            plant = Plant(pair)
-            plant.reset(at, centre)
-            plant.carry(payload, at)
-            fresh = linearise(plant, at, np.zeros(2), DT, force)
-            near = at + rng.normal(0, 1e-3, 6) * [1, 1, 10, 10, 1, 1]
-            u = rng.normal(0, 1, 2)
-            off = np.abs(model(near, u) - fresh(near, u))
-            assert (off < [2e-7, 2e-7, 1e-5, 1e-5, 1e-12, 1e-12]).all()
-        # The next period: the plan moves on by one, and a little to the side.
-        path = np.vstack([path[1:], path[-1] + [2e-3, 1e-3, 0, 0, 5e-3, -5e-3]])
-        path = path + np.array([1e-5, -1e-5, 0, 0, 1e-5, 0]) * (step % 2) + (step == 3) * 3e-3
-        force = force + [0.02, -0.01]
 
 
 def test_along_the_plan_little_is_linearised_twice(scene, monkeypatch):

@@ -10,14 +10,12 @@ from pcr_mpc import (
     LinearMPC,
     Plant,
     inverse_statics,
-    linearise,
     load_scene,
     load_tuning,
     make_controller,
     simulate,
     solve_statics,
 )
-from pcr_mpc.loop.along_plan import AlongPlan
 from pcr_mpc.loop.controllers import HoldMotors
 from pcr_mpc.loop.feed_forward import feed_forward
 from pcr_mpc.loop.settings import Payload
@@ -137,7 +135,7 @@ def test_without_a_model_the_tuning_says_whether_to_raise(scene, fallback, monke
     def failing(*_):
         raise ConvergenceError("made up", residual=1.0, iterations=1, last=None)
 
-    monkeypatch.setattr("pcr_mpc.loop.tracking.linearise", failing)
+    monkeypatch.setattr("pcr_mpc.loop.foresight.Foresight.__call__", failing)
     if fallback == "raise":
         with pytest.raises(ConvergenceError, match="made up"):
             controller.step(0, at_rest(pose))
@@ -229,20 +227,3 @@ def test_a_large_shift_is_taken_in_steps_and_one_out_of_reach_not_at_all(pair, c
     assert target.shift(np.array([0.0, 0.9]), centre.q, centre.force).tolist() == held.tolist()
     target.start(centre)
     assert target.shift(centre.p, centre.q, centre.force) == pytest.approx([0.0, 0.0], abs=1e-9)
-
-
-def test_a_linear_model_is_of_its_own_external_force(pair, centre):
-    """What `AlongPlan` relies on where the force changes and the place does not: x+ is linear in it, by E."""
-    plants = [Plant(pair) for _ in range(3)]
-    along, x = AlongPlan(plants, 0.01), at_rest(centre)
-    along.reset(x, centre)
-    path, u = np.tile(x, (3, 1)), np.array([0.1, -0.2])
-    along.models(path, u, np.zeros(2), np.zeros(3))
-    force = np.array([0.2, -0.1])
-    moved = along.models(path, u, force, np.zeros(3))
-    plant = Plant(pair)
-    plant.reset(x, centre)
-    wanted = linearise(plant, x, u, 0.01, force)
-    for model in moved:
-        assert model(x, u) == pytest.approx(wanted(x, u), abs=1e-10)
-        assert model.force.tolist() == force.tolist()

@@ -198,7 +198,7 @@ def test_a_retuned_controller_decides_as_one_that_was_tuned_so_from_the_start(sc
     new._u, new._sent = controller._u, copy.copy(controller._sent)
     new._on_the_way.clear()
     new._on_the_way.extend(list(controller._sent)[len(controller._sent) - new._delay :])
-    new._target.__dict__.update(copy.copy(controller._target.__dict__))
+    new._foresight.target_from(controller._foresight)
     controller.retune(tuning)
     assert controller.name == tuning.name
     assert controller.tuning is tuning

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from operator import mul
 
 import numpy as np
@@ -15,10 +14,6 @@ from ..plant.robot import Robot
 
 _LARGEST_STEP = 0.1  # rad
 _ROUGH = 1e-2
-# Largest shift that is taken to first order: what is left out is of the order of its square, nanometres at the tip.
-_LINEAR = 1e-4  # rad
-# While shifts are small, the rods are brought along once in so many calls, to be near when they are asked.
-_FOLLOW = 10
 _SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
 
 
@@ -36,31 +31,12 @@ class MotorTarget(Remade):
 
     def __init__(self, robot: Robot) -> None:
         self._plant = Plant(robot)
-        self._shift, self._since = np.zeros(robot.n_rods), 0
+        self._shift = np.zeros(robot.n_rods)
 
     def start(self, pose: Equilibrium) -> None:
         """Begin at a pose on the branch of the reference, without a force."""
         self._plant.reset(np.concatenate([pose.p, [0.0, 0.0], pose.q]), pose)
-        self._shift, self._since = np.zeros(len(pose.q)), 0
-
-    def small_shift(
-        self, p: np.ndarray, q: np.ndarray, angles_per_force: np.ndarray, force: np.ndarray
-    ) -> np.ndarray | None:
-        """Angles by which the rods carry ``force`` besides what they carry at (p, q); None if they are not small.
-
-        It mostly takes no statics, and is what a controller meets whose model is right. ``angles_per_force``,
-        shape (n, 2), belongs to the pose (see `InverseDynamics`).
-        """
-        shift = angles_per_force @ force
-        if not max(map(abs, shift.tolist())) <= _LINEAR:
-            return None
-        self._shift = shift
-        self._since += 1
-        if self._since >= _FOLLOW:
-            self._since = 0
-            with suppress(PCRError):  # then the rods stay where they are, as in `shift`
-                self._plant.force(p, q + shift)
-        return self._shift
+        self._shift = np.zeros(len(pose.q))
 
     def shift(self, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Angles to add to q so that F = force at p; the last ones where the rods cannot follow."""

@@ -107,7 +107,8 @@ class TrackingController(Remade):
             self.observer.start(x)
         if self._foresight is None:
             self._foresight = self._make_foresight()
-        self._set_out(x, pose)
+        self._foresight.reset(x, pose)
+        self._write_constants()
         self._watch.reset(x, pose)
         self._inverse.start(pose)
         self._gate.start(pose.q)
@@ -175,10 +176,14 @@ class TrackingController(Remade):
         else:
             self._law = self._make_law(self._pose)
             self._law.prepare(resting, self._watch.combinations())
+        if self._graph_of(tuning) == self._graph_of(old) and self._delay == last.places.delay:
+            self._write_constants()
+            return
         pose = last.pose(here)
         self._foresight = self._make_foresight()
-        self._set_out(here, pose)
+        self._foresight.reset(here, pose)
         self._foresight.target_from(last)
+        self._write_constants()
         if model_changed:
             self._watch.reset(here, pose)
 
@@ -374,10 +379,15 @@ class TrackingController(Remade):
             self._make_model(), Plant(self.robot), places, self._scene.period, condense, compiled=tuning.model.compiled
         )
 
-    def _set_out(self, x: np.ndarray, pose: Equilibrium) -> None:
-        """Let the foresight begin at state x on the branch of ``pose``, with what does not change from step to step."""
+    @staticmethod
+    def _graph_of(tuning: Tuning) -> tuple[object, ...]:
+        """What of a tuning the graph that looks ahead is made of."""
+        weighed = tuning.velocity_weight > 0, tuning.angle_weight > 0
+        return tuning.model, tuning.horizon, tuning.law, *weighed
+
+    def _write_constants(self) -> None:
+        """Write into the graph that looks ahead what does not change from step to step."""
         assert self._foresight is not None
-        self._foresight.reset(x, pose)
         given = self._foresight.inputs
         if isinstance(self._law, LinearMPC):
             given["weights"][:] = stage_weights(self.tuning)
