@@ -18,6 +18,7 @@ LAWS = ("linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward")
 LINEARISE = ("here", "along_plan")
 INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
+SOLVERS = ("osqp", "daqp")
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,9 @@ class Tuning:
     input_weight : float
         On deviations of the motor rates from the feed-forward [1/(rad/s)^2].
     tolerance : float
-        OSQP's absolute and relative tolerance.
+        Of the QP's solver, absolute and relative.
     max_iterations : int
-        After which OSQP gives up.
+        After which the solver gives up.
     fallback : {"ladder", "raise"}
         What an unsolved QP leads to: the next best answer (see `LinearMPC`), or an error.
     model : Model
@@ -75,6 +76,8 @@ class Tuning:
         Gains on the tip's error and on its rate [1], [s].
     period : float or None
         Control period for which it was tuned [s]. None: the scene's.
+    solver : {"osqp", "daqp"}
+        Of the QPs: a first-order method, or a dense active set.
     """
 
     name: str
@@ -91,6 +94,7 @@ class Tuning:
     law: str = LAWS[0]
     pd: tuple[float, float] = (0.0, 0.0)
     period: float | None = None
+    solver: str = SOLVERS[0]
 
     def __post_init__(self) -> None:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
@@ -104,6 +108,8 @@ class Tuning:
             checked_number(name, getattr(self, name), minimum=0.0)
         if self.fallback not in FALLBACKS:
             raise ValueError(f"fallback is {self.fallback!r}, expected one of {', '.join(FALLBACKS)}")
+        if self.solver not in SOLVERS:
+            raise ValueError(f"solver is {self.solver!r}, expected one of {', '.join(SOLVERS)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +200,7 @@ def load_tuning(path: str | Path) -> Tuning:
             tolerance=solver.number("tolerance", 1e-5, above=0.0),
             max_iterations=solver.integer("max_iterations", 4000),
             fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),
+            solver=solver.text("name", SOLVERS[0], choices=SOLVERS),
             model=Model(
                 method=model.text("method", Model.method, choices=METHODS),
                 segments=model.integer("segments", Model.segments),
