@@ -70,7 +70,11 @@ def test_soft_rows_against_osqp(price):
         slack[: 2 * (k % 2)] = 0.0  # two rows are hard in every other problem
         lower = np.concatenate([middle - 0.3, np.zeros(2 * soft)])
         upper = np.concatenate([middle + 0.3, slack, slack])
-        q = np.concatenate([3 * rng.normal(size=size), np.full(2 * soft, price)])
+        if k % 4 == 0:
+            prices = price * rng.uniform(0.5, 1.5, 2 * soft)
+        q = np.concatenate([3 * rng.normal(size=size), prices])
+        if k == 6:
+            ours.reset()
         found = []
         for solver in (ours, others):
             solver.update(None, q, lower, upper, entries)

@@ -1,7 +1,5 @@
 """Each trap of DAQP's Python interface, and that the wrapper does not fall into it; and that it agrees with others."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -11,6 +9,8 @@ from pcr_mpc import InfeasibleError
 from pcr_mpc.control.daqp_solver import DAQPSolver
 from pcr_mpc.control.osqp_solver import QPSolver
 
+from .qp_check import by_enumeration, packed
+
 N, M = 3, 5
 A = np.random.default_rng(0).normal(size=(M, N))
 
@@ -18,10 +18,6 @@ A = np.random.default_rng(0).normal(size=(M, N))
 @pytest.fixture
 def solver():
     return DAQPSolver(sp.csc_matrix(A), tolerance=1e-7)
-
-
-def packed(hessian):
-    return np.concatenate([hessian[: j + 1, j] for j in range(len(hessian))])
 
 
 def data(seed=1, size=0.3):
@@ -34,28 +30,6 @@ def data(seed=1, size=0.3):
         "l": -size * np.ones(M),
         "u": 0.7 * size * np.ones(M),
     }, hessian
-
-
-def by_enumeration(hessian, q, a, lower, upper):
-    """Solve the conditions of Karush, Kuhn and Tucker for every set of active rows; the one that fits."""
-    for sides in product((-1, 0, 1), repeat=len(a)):
-        sides = np.array(sides)
-        rows = np.flatnonzero(sides)
-        if len(rows) > len(q):
-            continue
-        active, n = a[rows], len(q)
-        kkt = np.block([[hessian, active.T], [active, np.zeros((len(rows), len(rows)))]])
-        try:
-            z = np.linalg.solve(kkt, np.concatenate([-q, np.where(sides > 0, upper, lower)[rows]]))
-        except np.linalg.LinAlgError:
-            continue
-        value = a @ z[:n]
-        signed = (z[n:] * sides[rows] >= 0) | (lower == upper)[rows]
-        if signed.all() and (value <= upper + 1e-9).all() and (value >= lower - 1e-9).all():
-            y = np.zeros(len(a))
-            y[rows] = z[n:]
-            return z[:n], y
-    raise AssertionError("no active set fits")
 
 
 @pytest.mark.parametrize("size", [0.05, 0.3, 100.0])
@@ -208,9 +182,11 @@ def test_infeasible_names_the_row_and_spoils_nothing():
     # Equalities that contradict each other are found before DAQP begins.
     values["l"], values["u"] = np.r_[1.0, 1.0, -9, -9.0, 0.5], np.r_[1.0, 1.0, 9, 9.0, 0.5]
     solver.update(**values)
-    with pytest.raises(InfeasibleError, match="primal infeasible") as caught:
-        solver.solve()
-    assert caught.value.limit in (0, 1, 4)
+    for _ in range(2):
+        with pytest.raises(InfeasibleError, match="primal infeasible") as caught:
+            solver.solve()
+        assert caught.value.limit in (0, 1, 4)
+        solver.warm_start(np.zeros(N), np.ones(M))
     values["u"] = np.full(M, 0.2)
     values["l"] = -values["u"]
     solver.update(**values)
@@ -250,30 +226,67 @@ def test_iterations_are_capped_and_counted():
     solver.update(**values)
     solver.warm_start(np.zeros(n), np.zeros(n))
     assert solver.solve().iterations == solution.iterations  # from none
-    solver.reset()
-    solver.update(**values)
-    solver.warm_start(np.zeros(n), np.ones(n))
-    assert solver.solve().iterations <= 2
+    for most in (solution.iterations - 1, solution.iterations):
+        solver.reset()
+        solver.update(**values)
+        if most < solution.iterations:
+            with pytest.raises(InfeasibleError, match="maximum iterations"):
+                solver.solve(most)
+    assert solver.solve(most).iterations == most
+    for side in (1, -1):
+        solver.reset()
+        solver.update(**{**values, "q": -side * np.ones(n), "l": np.full(n, -0.5)})
+        solver.warm_start(np.zeros(n), side * np.ones(n))
+        assert solver.solve().iterations <= 2
 
 
-def test_a_solution_that_misses_the_tolerance_is_refused(solver):
-    class Careless:
-        def __init__(self, model):
-            self._model = model
+def test_small_violations_count():
+    """DAQP leaves rows out that are violated by less than 1e-6, whatever tolerance is asked for."""
+    solver = DAQPSolver(sp.identity(2, format="csc"), tolerance=1e-7)
+    solver.update(packed(np.eye(2)), np.array([-1.0 - 5e-7, 0.0]), -np.ones(2), np.ones(2))
+    solution = solver.solve()
+    assert solution.x == pytest.approx([1.0, 0.0], abs=1e-12)
+    assert solution.y == pytest.approx([5e-7, 0.0], rel=1e-6)
 
-        def __getattr__(self, name):
-            return getattr(self._model, name)
 
-        def solve(self):
-            x, *rest = self._model.solve()
-            return x + 1e-5, *rest
+def test_run_time_counts_updates_starts_and_solves(solver, monkeypatch):
+    """By a clock that ticks with every look at it."""
+    ticks = iter(range(100))
+    monkeypatch.setattr("pcr_mpc.control.daqp_solver.time.perf_counter", lambda: float(next(ticks)))
+    solver.update(**data()[0])
+    solver.warm_start(np.zeros(N), np.zeros(M))
+    assert solver.solve().run_time == 3.0
 
-    values, _ = data()
-    solver.update(**values)
-    solver.solve()
-    solver._model = Careless(solver._model)
-    with pytest.raises(InfeasibleError, match="solved inaccurate, residuals"):
-        solver.solve()
+
+class Careless:
+    """DAQP with an error in x or in the multipliers."""
+
+    def __init__(self, model, wrong_x, wrong_y):
+        self._model, self._wrong = model, (wrong_x, wrong_y)
+
+    def __getattr__(self, name):
+        return getattr(self._model, name)
+
+    def solve(self):
+        x, value, flag, info = self._model.solve()
+        return x + self._wrong[0], value, flag, {**info, "lam": info["lam"] + self._wrong[1]}
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4])
+@pytest.mark.parametrize("wrong", ["x", "y"])
+def test_a_solution_that_misses_the_tolerance_is_refused(wrong, size):
+    """What the tolerance is relative to grows with the problem, as OSQP's does."""
+    for off, accepted in ((0.5, True), (4.0, False)):
+        solver = DAQPSolver(sp.identity(N, format="csc"), tolerance=1e-6)
+        flat = 1e-3 if wrong == "x" else 1.0  # so flat that an error in x is none of the gradient
+        solver.update(flat * packed(np.eye(N)), -2 * flat * size * np.ones(N), -size * np.ones(N), size * np.ones(N))
+        error = off * 1e-6 * size
+        solver._model = Careless(solver._model, error * (wrong == "x"), error * (wrong == "y"))
+        if accepted:
+            assert solver.solve().y == pytest.approx(flat * size * np.ones(N))
+            continue
+        with pytest.raises(InfeasibleError, match="solved inaccurate, residuals"):
+            solver.solve()
 
 
 def test_reset_is_reproducible_bit_for_bit(solver):

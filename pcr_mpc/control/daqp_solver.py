@@ -3,9 +3,10 @@
 What DAQP does of itself, and what is done about it here: ``update`` drops arrays of a wrong shape without a word and
 keeps pointers to the others (they are checked and copied); a P that is not positive definite is shifted until it is,
 and another problem is solved (forbidden); rows that become soft after set-up overrun its memory (all that may ever be
-soft are so at set-up); the multipliers that it returns of an unsolved problem are those of the one before (they
-exist only if the problem was solved); its tolerance is on scaled rows (residuals are computed from the data, and
-decide).
+soft are so at set-up); the multipliers that it returns of an unsolved problem are those of the one before (they exist
+only if the problem was solved); after an unsolved problem it goes on from where it gave up (it begins with no active
+row); it leaves rows out that are violated by less than 1e-6 (by less than the tolerance here), and nothing checks its
+answer (residuals are computed from the data, and decide).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _INFEASIBLE = (-1, -6)  # -6: the equalities alone contradict each other
 _NOT_CONVEX = -5
 _STATUS = {-2: "cycling", -4: "maximum iterations reached", 4: "solved inaccurate"}
 _ACTIVE, _ACTIVE_BELOW, _SOFT = 1, 3, 8
-_FIRM = 1e-2  # of the tolerance: DAQP's own, so that rounding does not decide whether a solution is accepted
+_FIRM = 1e-2  # of the tolerance: DAQP's own, so that a row that it may leave out cannot decide on acceptance
 _GIVING = 1e-8  # reciprocal price where every row gives way
 
 
@@ -104,7 +105,7 @@ class DAQPSolver(CheckedQP):
         if y is None:
             return
         self._y = y[: self._rows]
-        if self._data is not None and self._flag == 0:
+        if self._data is not None:
             began = time.perf_counter()
             self._flag = self._model.update(sense=self._senses())
             self._spent += time.perf_counter() - began
@@ -203,8 +204,7 @@ class DAQPSolver(CheckedQP):
     def _forget(self) -> None:
         """Let no row of an unsolved problem be active in the next."""
         self._y = np.zeros(self._rows)
-        if self._flag == 0:
-            self._flag = self._model.update(sense=self._senses())
+        self._flag = self._model.update(sense=self._senses())
 
     def _whole(self, core: np.ndarray, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """x and y with the slacks and their multipliers."""
