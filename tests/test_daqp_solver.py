@@ -24,12 +24,8 @@ def data(seed=1, size=0.3):
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(N, N))
     hessian = root @ root.T + 0.1 * np.eye(N)
-    return {
-        "P": packed(hessian),
-        "q": rng.normal(size=N),
-        "l": -size * np.ones(M),
-        "u": 0.7 * size * np.ones(M),
-    }, hessian
+    bounds = {"l": -size * np.ones(M), "u": 0.7 * size * np.ones(M)}
+    return {"P": packed(hessian), "q": rng.normal(size=N), **bounds}, hessian
 
 
 @pytest.mark.parametrize("size", [0.05, 0.3, 100.0])
