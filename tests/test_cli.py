@@ -89,6 +89,12 @@ def test_timing(scene, tmp_path, capsys, monkeypatch):
     assert step["interrupted"] == 0
     assert sum(row["n"] for row in result["iterations"]) == 80
     assert sum(result["control_parts"].values()) == pytest.approx(step["mean"])
+    solvers = {row["solver"]: row for row in result["solvers"]}
+    assert list(solvers) == ["OSQP", "DAQP"]
+    assert solvers["OSQP"]["n"] == 80
+    for row in solvers.values():
+        assert 0 < row["inside"]["p50"] < row["step"]["p50"] <= row["step"]["p99"] <= row["step"]["max"]
+    assert 1 <= solvers["DAQP"]["iterations"]["max"] < solvers["OSQP"]["iterations"]["p50"]
     text = timing_tables(result)
     for component in result["components"]:
         (line, *_) = (

@@ -2,10 +2,11 @@
 
 Two scenes: `lemniscate`, nominal, and `limited`, where the rate limit is active; plant and model are the same robot.
 Every file in controllers/ as it is, and those that plan with other horizons, by one linear model a step ("here") and by
-models along the plan. The nonlinear MPC (Gauss collocation, IPOPT) and do-mpc (Radau collocation, IPOPT; it is given
-the true velocity), and where it is installed Crocoddyl (Box-FDDP on our plant and its linear models, called back in
-Python; likewise) have the weights of controllers/nonlinear.toml. The error is the RMS after the first second; a period
-that was not answered by a solved problem is a failure, and so are all periods after a run has stopped.
+models along the plan. With DAQP instead of OSQP: the default along the plan, with every horizon. The nonlinear MPC
+(Gauss collocation, IPOPT) and do-mpc (Radau collocation, IPOPT; it is given the true velocity), and where it is
+installed Crocoddyl (Box-FDDP on our plant and its linear models, called back in Python; likewise) have the weights of
+controllers/nonlinear.toml. The error is the RMS after the first second; a period that was not answered by a solved
+problem is a failure, and so are all periods after a run has stopped.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pcr_mpc.loop.scene import Scene
 ROOT = Path(__file__).parent.parent.parent
 SCENES = {"nominal": "lemniscate", "limited": "limited"}
 DO_MPC, CROCODDYL = "do-mpc", "Crocoddyl"
+DAQP = "default, DAQP"
 FILES = ("default", "slow_motors", "frozen", "robust", "shooting", "nonlinear", "lqr", "pd", "open_loop")
 SWEPT = ("default", "frozen", "robust")
 _LOST = 20.0  # mm; more is no tracking
@@ -64,6 +66,9 @@ def points(plan: Plan) -> dict[Key, Callable[[], Row]]:
             filed = load_tuning(ROOT / "controllers" / f"{file}.toml")
             for tuning in _variants(file, filed, plan):
                 found[case, file, _settings(tuning)] = partial(_measured, scene, tuning)
+                if file == "default" and tuning.model.linearise == "along_plan":
+                    other = replace(tuning, solver="daqp")
+                    found[case, DAQP, _settings(tuning)] = partial(_measured, scene, other)
         for peer in _peers():
             for horizon in plan.peers:
                 tuning = replace(load_tuning(ROOT / "controllers" / "nonlinear.toml"), horizon=horizon)

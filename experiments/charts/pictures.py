@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.charts.control import CROCODDYL, DO_MPC, SCENES
+from experiments.charts.control import CROCODDYL, DAQP, DO_MPC, SCENES
 from experiments.charts.draw import Look, Style, draw_front, draw_legend, draw_points
 from experiments.charts.motion import ELASTICA, MUJOCO, YARDSTICK
 from experiments.charts.points import Row
@@ -193,6 +193,7 @@ MOTION = Look(
 CONTROL = Look(
     {f"{file}, {name}": (colour, marker, 6.0) for file, colour in _LINEAR.items() for name, marker in _MODES.values()}
     | {
+        DAQP: (GREEN, "h", 7),
         "nonlinear": (RED, "D", 6),
         DO_MPC: (PURPLE, "P", 8),
         CROCODDYL: (PURPLE, "X", 8),

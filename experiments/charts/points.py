@@ -27,7 +27,7 @@ FIELDS = (
     "evaluations", "time_p50", "time_p5", "time_p95", "time_p99", "remark", "machine", "versions", "commit",
 )  # fmt: skip
 _NUMBERS = ("error", "error_max", "iterations", "evaluations", "time_p50", "time_p5", "time_p95", "time_p99")
-_PACKAGES = ("casadi", "numpy", "scipy", "osqp", "mujoco", "pyelastica", "do_mpc", "crocoddyl")
+_PACKAGES = ("casadi", "numpy", "scipy", "osqp", "daqp", "mujoco", "pyelastica", "do_mpc", "crocoddyl")
 
 
 def times(seconds: Sequence[float] | np.ndarray) -> Row:

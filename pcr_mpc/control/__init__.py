@@ -1,1 +1,1 @@
-"""Linear model-predictive control on OSQP."""
+"""Linear model-predictive control on OSQP or DAQP."""

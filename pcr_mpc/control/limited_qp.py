@@ -12,8 +12,10 @@ from scipy.linalg.lapack import dpotrf
 from ..errors import InfeasibleError
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModels
-from .osqp_solver import QPSolver, Solution
+from .daqp_solver import DAQPSolver
+from .osqp_solver import QPSolver
 from .qp import QuadraticProgram, constraint_matrix
+from .qp_solver import CheckedQP, Solution
 from .tuning import Tuning
 
 # Price of a limit that gives way by a radian, over the cost of the tip's way per radian. The penalty is exact while it
@@ -108,7 +110,12 @@ class LimitedQP:
             first += horizon * width
         self._later = np.concatenate(later)
         self._last: Solution | None = None
-        self._solver = QPSolver(matrix, _TOLERANCE * tuning.tolerance, tuning.max_iterations, identity=True)
+        settings = _TOLERANCE * tuning.tolerance, tuning.max_iterations
+        self._solver: CheckedQP
+        if tuning.solver == "daqp":
+            self._solver = DAQPSolver(matrix, *settings, identity=True, soft=soft)
+        else:
+            self._solver = QPSolver(matrix, *settings, identity=True)
 
     def reset(self) -> None:
         """Start afresh."""

@@ -25,6 +25,7 @@ FALLBACKS = ("ladder", "raise")
 SAME_ANGLE = 1e-9
 # Matrices grow with the square of the horizon: at this one they are made in half a minute.
 LONGEST_HORIZON = 400
+SOLVERS = ("osqp", "daqp")
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,9 @@ class Tuning:
     input_weight : float
         On deviations of the motor rates from the feed-forward [1/(rad/s)^2].
     tolerance : float
-        OSQP's absolute and relative tolerance; the absolute one is of rates [rad/s].
+        Of the QP's solver, absolute and relative; OSQP's absolute one is of rates [rad/s].
     max_iterations : int
-        After which OSQP gives up.
+        After which the solver gives up.
     fallback : {"ladder", "raise"}
         What an unsolved QP leads to: the next best answer (see `LinearMPC`), or an error.
     model : Model
@@ -96,6 +97,8 @@ class Tuning:
         Gains on the tip's error and on its rate [1], [s].
     period : float or None
         Control period for which it was tuned [s]. None: the scene's.
+    solver : {"osqp", "daqp"}
+        Of the QPs: a first-order method, or a dense active set.
     """
 
     name: str
@@ -112,6 +115,7 @@ class Tuning:
     law: str = LAWS[0]
     pd: tuple[float, float] = (0.0, 0.0)
     period: float | None = None
+    solver: str = SOLVERS[0]
 
     def __post_init__(self) -> None:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
@@ -126,6 +130,7 @@ class Tuning:
         for name in ("velocity_weight", "angle_weight"):
             object.__setattr__(self, name, checked_number(name, getattr(self, name), minimum=0.0))
         _check_choice("fallback", self.fallback, FALLBACKS)
+        _check_choice("solver", self.solver, SOLVERS)
         object.__setattr__(self, "pd", tuple(checked_vector("pd", self.pd, 2).tolist()))
         if self.period is not None:
             object.__setattr__(self, "period", checked_number("period", self.period, above=0.0))
@@ -287,6 +292,7 @@ def load_tuning(path: str | Path) -> Tuning:
             tolerance=solver.number("tolerance", 1e-5, above=0.0),
             max_iterations=solver.integer("max_iterations", 4000),
             fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),
+            solver=solver.text("name", SOLVERS[0], choices=SOLVERS),
             model=Model(
                 method=model.text("method", Model.method, choices=METHODS),
                 segments=model.integer("segments", Model.segments),

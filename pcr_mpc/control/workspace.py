@@ -12,12 +12,14 @@ from ..errors import InfeasibleError
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel, LinearModels
 from .condensing import checking
+from .daqp_solver import DAQPSolver
 from .limited_qp import Limited, LimitedQP, active_kinds
-from .osqp_solver import QPSolver, Solution
+from .osqp_solver import QPSolver
 from .qp import QuadraticProgram, constraint_matrix, motor_bounds
+from .qp_solver import Solution
 from .tuning import Limits, Tuning
 
-_FEWEST_ITERATIONS = 10  # with which OSQP is tried at all
+_FEWEST_ITERATIONS = 10  # with which a solver is tried at all
 
 
 class Workspace:
@@ -34,11 +36,12 @@ class Workspace:
         self.n, self.dt, self._reach = model.B.shape[1], model.dt, model.reach
         self._tuning = tuning
         rates = constraint_matrix(tuning.horizon, self.n)[: 2 * tuning.horizon * self.n].tocsc()
-        self._rates_only = QPSolver(rates, tuning.tolerance, tuning.max_iterations)
+        solver = DAQPSolver if tuning.solver == "daqp" else QPSolver
+        self._rates_only = solver(rates, tuning.tolerance, tuning.max_iterations)
         self._groups = np.repeat(["rate", "rate change"], tuning.horizon * self.n)
         self._limited: dict[tuple[str, ...], LimitedQP] = {}
         self._limits_matter = False  # in the last plan, beside those on the rates
-        self._spent, self._inside = 0, 0.0  # iterations and seconds of OSQP in this control step
+        self._spent, self._inside = 0, 0.0  # iterations and seconds of the solver in this control step
         self.check = Check(tuning.horizon, self.n, compiled=tuning.model.compiled)
 
     def limited(self, kinds: tuple[str, ...]) -> LimitedQP:

@@ -12,6 +12,7 @@ from .tables import table
 
 _FIGURES = ("p50", "p95", "p99", "p99.9", "max")
 _PART_COLOURS = {"linearise": BLUE, "QP update": SKY, "QP handed over": GREEN, "inside OSQP": ORANGE,
+                 "inside DAQP": ORANGE,
                  "observer": PURPLE, "rest": GREY}  # fmt: skip
 _BUDGETS_HZ = {"plant step": (1000,), "control step": (100, 200, 500)}
 
@@ -60,6 +61,20 @@ def timing_tables(result: dict[str, Any]) -> str:
         parts.append(table(("a control step, nobody interrupting", "mean [us]", "share"), rows))
         rows = [(str(c["iterations"]), *(_us(c[key]) for key in _FIGURES), str(c["n"])) for c in result["iterations"]]
         parts.append(table(("QP iterations", *_FIGURES, "steps"), rows))
+    if result.get("solvers"):
+        rows = [
+            (
+                row["solver"],
+                *(_us(row["step"][key]) for key in ("p50", "p99", "max")),
+                *(_us(row["inside"][key]) for key in ("p50", "p99", "max")),
+                *(f"{row['iterations'][key]:.0f}" for key in ("p50", "p99", "max")),
+                str(row["n"]),
+            )
+            for row in result["solvers"]
+        ]
+        columns = ("QP solvers [us]", "control step p50", "p99", "max", "inside p50", "p99", "max",
+                  "iterations p50", "p99", "max", "steps")  # fmt: skip
+        parts.append(table(columns, rows))
     names = dict.fromkeys(row["name"] for row in result["overhead"])
     codes = list(dict.fromkeys(row["code"] for row in result["overhead"]))
     found = {(row["name"], row["code"]): row["us"] for row in result["overhead"]}

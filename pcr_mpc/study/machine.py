@@ -39,5 +39,5 @@ def versions() -> dict[str, str]:
     """Versions of what does the arithmetic."""
     return {
         "python": platform.python_version(),
-        **{name: version(name) for name in ("casadi", "numpy", "scipy", "osqp")},
+        **{name: version(name) for name in ("casadi", "numpy", "scipy", "osqp", "daqp")},
     }

@@ -25,7 +25,8 @@ PLANT_HZ = (1000.0,)
 CONTROL_HZ = (100.0, 200.0, 500.0)
 # Fewer calls of what is slow say as much.
 _SHARE = {"closed_form": 1.0, "multiple_shooting": 0.2, "single_shooting": 0.01}
-PARTS = ("linearise", "QP update", "QP handed over", "inside OSQP", "observer", "rest")
+SOLVERS = {"osqp": "OSQP", "daqp": "DAQP"}
+_OTHER_SOLVER = 0.2  # share of the control steps that are repeated with another QP solver
 _BINS = np.geomspace(1.0, 1e5, 101)  # us
 
 
@@ -48,7 +49,9 @@ def time_scene(scene: Scene, steps: int = 100_000, *, progress: bool = False) ->
         ``collector_off``, ``collections``, ``interrupted`` and ``misses`` (see `stopwatch`); plant steps also have
         ``force_error``, the largest relative error of F along the run. ``histogram``: counts of the steps by time.
         ``control_parts``: mean times [us] of what a control step consists of, and ``iterations``: times [us] by number
-        of QP iterations, both of steps that nobody interrupted. ``overhead``: see `call_overhead`. ``machine``, with
+        of QP iterations, both of steps that nobody interrupted. ``solvers``: of the linear MPC, the scene's QP solver
+        and the others on the same states: {solver, step, inside, iterations, n}, with p50, p99 and max of the
+        control step and of the solver [us], and of iterations. ``overhead``: see `call_overhead`. ``machine``, with
         its load before and after; ``versions``.
     """
     before = machine()
@@ -72,6 +75,7 @@ def time_scene(scene: Scene, steps: int = 100_000, *, progress: bool = False) ->
     if isinstance(controller, TrackingController):
         times, parts, iterations = _control_times(scene, run, steps, "control step" if progress else None)
         model = scene.tuning.model.method if scene.tuning else ""
+        result["solvers"] = _solvers(scene, run, (times, parts, iterations), steps, progress)
         components.append(times.record("control step", model, CONTROL_HZ))
         components += [{"name": name, "method": model, **distribution(part)} for name, part in parts.items()]
         between = distribution(run.control_time[WARM_UP:, 0])
@@ -88,6 +92,34 @@ def time_scene(scene: Scene, steps: int = 100_000, *, progress: bool = False) ->
     result["overhead"] = call_overhead(scene.robot, run.pose)
     after = machine()
     return {**result, "machine": {**before, "load_after": after["load"]}, "versions": versions()}
+
+
+def _solvers(
+    scene: Scene, run: Run, own: tuple[Times, dict[str, np.ndarray], np.ndarray], steps: int, progress: bool
+) -> list[dict[str, Any]]:
+    """Control steps of the linear MPC with every QP solver, side by side; ``own`` are those of the scene's."""
+    tuning = scene.tuning
+    if tuning is None or tuning.law != "linear_mpc":
+        return []
+    rows = []
+    for solver, name in SOLVERS.items():
+        measured = own
+        if solver != tuning.solver:
+            other = scene.tuned(replace(tuning, solver=solver))
+            n = max(WARM_UP + 10, round(steps * _OTHER_SOLVER))
+            measured = _control_times(other, run, n, f"control step, {name}" if progress else None)
+        times, parts, iterations = measured
+        step, inside = times.wall[WARM_UP:], parts[f"inside {name}"]
+        rows.append(
+            {"solver": name, "step": _tail(1e6 * step), "inside": _tail(1e6 * inside), "iterations": _tail(iterations),
+             "n": len(step)}
+        )  # fmt: skip
+    return rows
+
+
+def _tail(values: np.ndarray) -> dict[str, float]:
+    p50, p99, most = np.percentile(values, [50, 99, 100]).tolist()
+    return {"p50": p50, "p99": p99, "max": most}
 
 
 def _counts(times: Times) -> dict[str, list[int]]:
@@ -189,7 +221,9 @@ def _control_times(
     controller = make_controller(scene, reference=reference)
     assert isinstance(controller, TrackingController)
     states, lap = run.x[:: run.steps_per_period], len(run.u)
-    parts, iterations = np.zeros((n, len(PARTS))), np.zeros(n, dtype=int)
+    inside = f"inside {SOLVERS[scene.tuning.solver]}"
+    names = ("linearise", "QP update", "QP handed over", inside, "observer", "rest")
+    parts, iterations = np.zeros((n, len(names))), np.zeros(n, dtype=int)
     observer = _TimedObserver(None)
 
     def restart(k: int) -> None:
@@ -212,4 +246,4 @@ def _control_times(
     times = measure(step, n, restart, label)
     parts[:, 5] = times.wall - parts[:, :5].sum(axis=1)
     parts = parts[WARM_UP:]
-    return times, {name: parts[:, i] for i, name in enumerate(PARTS)}, iterations[WARM_UP:]
+    return times, {name: parts[:, i] for i, name in enumerate(names)}, iterations[WARM_UP:]
