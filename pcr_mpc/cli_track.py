@@ -22,6 +22,7 @@ from .loop.simulate import simulate
 from .loop.simulated_plant import SimulatedPlant
 from .loop.tracking import make_controller
 from .plant.mujoco_plant import MuJoCoPlant
+from .report.plots import animate_run, plot_run
 from .report.tables import summary_table
 
 _PICTURES = ("track.png", "track.gif")
@@ -81,8 +82,6 @@ def _complete(run: Run, summary: dict[str, Any], pictures: bool, folder: Path) -
 
 def _drawn(run: Run, folder: Path) -> bool:
     """Draw a run; what cannot be drawn, as a robot that was lost, is said and no reason to lose the figures."""
-    from .report.plots import animate_run, plot_run  # which load Matplotlib
-
     picture, animation = (folder / name for name in _PICTURES)
     try:
         plot_run(run, picture)

@@ -183,4 +183,5 @@ def test_a_plant_that_is_elsewhere_gets_answers():
         rungs.add(decision.plan.fallback)
         u = decision.u
     assert None in rungs
-    assert rungs & {"shifted_plan", "lqr"}
+    # Rods are followed until they are straight, and what is out of reach is bridged: the limits of poses give way.
+    assert "softened" in rungs

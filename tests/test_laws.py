@@ -112,18 +112,3 @@ def test_limits_of_the_one_step_laws_are_named(at_rest, pair):
         plan = law.solve(x, model, Reference(x[None], np.array([wanted])), np.zeros(2))
         assert plan.active == active
     assert plan.inputs[0] == pytest.approx([-1.0, 0.0])
-
-
-def test_along_the_plan_little_is_linearised_twice(scene, monkeypatch):
-    from pcr_mpc.loop import along_plan
-
-    count = 0
-
-    def counted(*arguments):
-        nonlocal count
-        count += 1
-        return linearise(*arguments)
-
-    monkeypatch.setattr(along_plan, "linearise", counted)
-    rms_mm(scene, "default")
-    assert 140 < count < 2 * 150

@@ -33,7 +33,7 @@ def test_do_mpc_decides_as_the_nonlinear_mpc(scene):
     theirs.start(pose)
     ours.start(pose)
     plant = Plant(scene.robot, integrator="rk4", dt=1e-3)
-    x = np.concatenate([pose.p + [0.004, -0.003], [0.1, 0.0], pose.q])
+    x = np.concatenate([pose.p + [0.003, -0.002], [0.1, 0.0], pose.q])
     plant.reset(x, pose)
     limits = motor_limits(scene.robot, scene.period)
     fastest, largest_change, last = 0.0, 0.0, np.zeros(2)

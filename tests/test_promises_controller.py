@@ -40,13 +40,13 @@ def scene():
 @pytest.fixture
 def asked(monkeypatch):
     """What the linear MPC is asked: (x, models, window) of every call."""
-    calls, solve = [], LinearMPC.solve
+    calls, decide = [], LinearMPC.decide
 
-    def spy(self, x, models, reference, *others):
+    def spy(self, qp, x, models, reference, *others):
         calls.append((x, models, reference))
-        return solve(self, x, models, reference, *others)
+        return decide(self, qp, x, models, reference, *others)
 
-    monkeypatch.setattr(LinearMPC, "solve", spy)
+    monkeypatch.setattr(LinearMPC, "decide", spy)
     return calls
 
 

@@ -299,7 +299,7 @@ class TrackingController(Remade):
             states = reference.states[row + 1 : row + 1 + horizon].copy()
             states[:, 4:] += self._foresight.inputs["shift"]
             return self._law.fall_back(failure, estimate, Reference(states, inputs, forces + force), self._u), estimate
-        window, ahead = Reference(outlook.states, inputs, forces + force), outlook.ahead.copy()
+        window, ahead = Reference(outlook.states.copy(), inputs, forces + force), outlook.ahead.copy()
         if isinstance(self._law, LinearMPC):
             p, q, lower, upper = outlook.qp
             qp = QuadraticProgram(p, q, constraint_matrix(horizon, self.robot.n_rods), lower, upper)
