@@ -74,7 +74,7 @@ def test_timing(scene, tmp_path, capsys, monkeypatch):
     result = json.loads(capsys.readouterr().out)
     names = {(c["name"], c["method"]) for c in result["components"]}
     assert {("plant step", m) for m in ("closed_form", "multiple_shooting", "single_shooting")} <= names
-    for name in ("control step", "linearise", "QP update", "inside OSQP", "observer"):
+    for name in ("control step", "look ahead", "QP update", "inside OSQP"):
         assert (name, "closed_form") in names
     for component in result["components"]:
         ordered = [component[key] for key in ("p50", "p95", "p99", "p99.9", "max")]

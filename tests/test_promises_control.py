@@ -156,20 +156,6 @@ def test_one_step_laws_keep_every_limit_and_fall_back_to_rest(model, tuning, lim
 # Limits of motors
 
 
-def test_clipped_meets_rate_and_change_on_both_sides(limits):
-    for sign in (-1, 1):
-        u = limits.clipped(sign * np.array([9.0, 0.1]), sign * np.array([0.2, 0.0]))
-        assert u == pytest.approx(sign * np.array([0.7, 0.1]))
-        assert limits.clipped(sign * np.array([9.0, 9.0]), sign * np.array([1.8, 2.0])).tolist() == [sign * 2.0] * 2
-
-
-def test_within_stops_ends_at_a_stop_and_comes_back_to_it(limits):
-    q = np.array([8.99, -8.99])
-    assert limits.within_stops(np.array([2.0, -2.0]), q, DT) == pytest.approx([1.0, -1.0])
-    assert limits.within_stops(np.array([-2.0, 2.0]), q, DT) == pytest.approx([-2.0, 2.0])
-    assert limits.within_stops(np.zeros(2), np.array([9.01, -9.01]), DT) == pytest.approx([-1.0, 1.0])
-
-
 def test_met_by_names_what_is_in_the_way(limits):
     previous = np.array([1.8, 0.0])
     for u, met in (
@@ -236,9 +222,10 @@ def test_what_a_model_or_an_observer_cannot_be_is_refused():
 
 TOML = {
     "name": '"t"', "horizon": "7", "period": "0.02", "weights": {"position": "2.0", "velocity": "3.0", "angle": "4.0",
-    "input": "5.0"}, "solver": {"tolerance": "1e-6", "max_iterations": "11", "fallback": '"raise"'},
+    "input": "5.0"}, "solver": {"name": '"daqp"', "tolerance": "1e-6", "max_iterations": "11", "fallback": '"raise"'},
     "model": {"method": '"multiple_shooting"', "segments": "3", "steps": "2", "scheme": '"rk4"',
-    "inertia": '"condensed"', "linearise": '"along_plan"', "payload": "false", "predict_delay": "false"},
+    "inertia": '"condensed"', "linearise": '"along_plan"', "payload": "false", "predict_delay": "false",
+    "compiled": "false"},
     "observer": {"on": "true", "tip_noise": "1e-4", "force_noise": "0.02", "force_walk": "0.03"},
 }  # fmt: skip
 
@@ -260,9 +247,9 @@ def test_every_setting_of_a_file_arrives(tmp_path):
     tuning = load_tuning(written(tmp_path / "t.toml", TOML))
     assert (tuning.name, tuning.horizon, tuning.period, tuning.fallback) == ("t", 7, 0.02, "raise")
     assert (tuning.position_weight, tuning.velocity_weight, tuning.angle_weight, tuning.input_weight) == (2, 3, 4, 5)
-    assert (tuning.tolerance, tuning.max_iterations) == (1e-6, 11)
+    assert (tuning.solver, tuning.tolerance, tuning.max_iterations) == ("daqp", 1e-6, 11)
     assert [getattr(tuning.model, f.name) for f in fields(tuning.model)] == [
-        "multiple_shooting", 3, 2, "rk4", "condensed", "along_plan", False, False,
+        "multiple_shooting", 3, 2, "rk4", "condensed", "along_plan", False, False, False,
     ]  # fmt: skip
     assert tuning.observer == ObserverTuning(1e-4, 0.02, 0.03)
     assert load_tuning(written(tmp_path / "t.toml", TOML, [("observer", "on", "false")])).observer is None

@@ -39,7 +39,7 @@ def test_too_much_stiffness_for_the_period_is_refused(pair, centre, x0):
         linearised(replace(pair, drag=0.0), centre, x0, 1.001 * longest)
 
 
-@pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf, True, "0.01", 9e-13])
+@pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf, True, "0.01"])
 def test_a_period_is_a_positive_number(pair, centre, x0, dt):
     with pytest.raises(ValueError, match="dt"):
         linearised(pair, centre, x0, dt)

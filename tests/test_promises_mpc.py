@@ -12,6 +12,7 @@ from pcr_mpc.control.qp import build_qp
 from pcr_mpc.control.tuning import Limits
 from pcr_mpc.control.workspace import Workspace
 from pcr_mpc.linearisation.linear_limits import LinearLimits
+from pcr_mpc.linearisation.linear_model import LinearModels
 
 from .conftest import CONTROLLERS
 
@@ -105,11 +106,11 @@ def test_a_reset_repeats_bit_for_bit_where_limits_are_active(tuning, target, mod
 def test_a_limited_qp_forgets_its_last_solution_at_a_reset(tuning, target, model, reference):
     limits = Limits(6.0, 3.0, target[4:] - 0.01, target[4:] + 0.01)
     qp = build_qp(off(target), model, reference, NONE, tuning, limits, terminal_weight(model, tuning))
-    used, fresh = LimitedQP(tuning, 2, DT), LimitedQP(tuning, 2, DT)
+    used, fresh = (LimitedQP(tuning, 2, DT, reach=model.reach) for _ in range(2))
     warm = 0.1 * np.ones(2 * N)
 
     def solve(solver):
-        answer = solver.solve(qp, off(target), [model], None, soft_angles=False, warm=warm)
+        answer = solver.solve(qp, off(target), LinearModels.of([model]), None, soft_angles=False, warm=warm)
         return answer.solution.iterations, answer.inputs.tolist()
 
     cold = solve(fresh)
@@ -208,7 +209,7 @@ def test_rows_left_out_are_not_broken(tuning, target, model, reference, wide):
 
     def solved(limits):
         qp = build_qp(off(target), model, reference, NONE, tuning, limits, weight)
-        return Workspace(tuning, model).solve(qp, off(target), [model], None, limits, None)
+        return Workspace(tuning, model).solve(qp, off(target), LinearModels.of([model]), None, limits, None)
 
     free = solved(wide)
     angles = free.states[1:, 4:]

@@ -256,10 +256,10 @@ def test_tune_takes_storage_seed_period_and_episodes_from_its_options(tmp_path, 
         Costs(1.0, 0.1, 10.0, 100.0, 1.0, 0.0, 0.0))}])  # fmt: skip
     scene = str(SCENES / "lemniscate.toml")
     assert main(["tune", scene, "--storage", "sqlite:///x.db", "--keep-period", "--seed", "5", "--episodes", "3",
-                 "--trials", "7", "--json"]) == 0  # fmt: skip
+                 "--trials", "7", "--json", "--out", "a.toml"]) == 0  # fmt: skip
     record = json.loads(capsys.readouterr().out)
     assert (record["storage"], record["chosen"], record["trials"]) == ("sqlite:///x.db", None, 1)
-    assert main(["tune", scene]) == 0
+    assert main(["tune", scene, "--out", "b.toml"]) == 0
     (given, trials), (default, usual) = searches
     assert (given.storage, given.keep_period, given.seed, given.episodes, trials) == ("sqlite:///x.db", True, 5, 3, 7)
     assert (default.keep_period, default.seed, default.episodes, usual) == (False, 0, 24, 50)
@@ -270,7 +270,7 @@ def test_tune_takes_storage_seed_period_and_episodes_from_its_options(tmp_path, 
 
 @pytest.mark.parametrize(("words", "said"), [((), "interrupted"), (("rows are kept",), "rows are kept")])
 def test_an_interrupt_has_its_own_status(words, said, monkeypatch, capsys):
-    def interrupted(options):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt(*words)
 
     monkeypatch.setattr(cli_study, "choose", interrupted)

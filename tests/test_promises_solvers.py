@@ -13,6 +13,7 @@ from pcr_mpc.control.nlp_solver import Point
 from pcr_mpc.control.nonlinear_mpc import NonlinearMPC
 from pcr_mpc.control.osqp_solver import QPSolver
 from pcr_mpc.control.tuning import Limits
+from pcr_mpc.linearisation.linear_model import LinearModels
 
 from .conftest import CONTROLLERS
 
@@ -224,5 +225,7 @@ def test_a_qp_that_is_not_convex_is_refused_by_its_minor(tuning, model, referenc
     P = qp.P.copy()
     P[2] = -1.0  # second entry of the diagonal
     with pytest.raises(InfeasibleError, match="the leading minor 2 of P is not positive") as caught:
-        LimitedQP(tuning, 2, DT).solve(replace(qp, P=P), np.zeros(6), [model], None, soft_angles=False)
+        LimitedQP(tuning, 2, DT, reach=model.reach).solve(
+            replace(qp, P=P), np.zeros(6), LinearModels.of([model]), None, soft_angles=False
+        )
     assert caught.value.status == "non convex"

@@ -139,5 +139,5 @@ def test_parameters_become_tunings_of_three_digits_and_back(scene):
     assert (ranges["input_weight"].low, ranges["input_weight"].high) == (1e-5, 200.0)
     assert "period" not in space(replace(search, keep_period=True))
     assert "period" not in space(replace(search, scene=replace(scene, deadline=0.004)))
-    brief = replace(search, scene=replace(scene, duration=0.012))
+    brief = replace(search, scene=replace(scene, duration=0.01))
     assert set(space(brief)["period"].choices) == {0.005, 0.01}

@@ -58,6 +58,7 @@ class LinearMPC:
         self._gain: np.ndarray | None = None
         self._last: Plan | None = None
         self._age = math.inf  # periods since a plan was solved
+        self._dt = 1.0  # of any model; until there is one, motors are only brought to rest
         self._prepared: tuple[LinearModel, Sequence[tuple[str, ...]]] | None = None
         self._first: LinearModel | None = None  # whose terminal weight it is, if nobody called prepare
         self._problem: tuple[Limits, float, float] | None = None  # limits and sizes of the last problem
@@ -169,7 +170,7 @@ class LinearMPC:
         self._workspace.require(sequence)
         window = Reference(wanted, feed_forward)
         qp = assemble(x, sequence, window, u_previous, self.tuning, self.limits, self._terminal_weight)
-        return self.decide(qp, x, sequence, window, u_previous, pose_limits, began)
+        return self.decide(qp, x, sequence, window, u_previous, pose_limits, began, models)
 
     def decide(
         self,
@@ -180,9 +181,12 @@ class LinearMPC:
         u_previous: np.ndarray,
         pose_limits: LinearLimits | None,
         began: float,
+        told: LinearModel | Sequence[LinearModel] | None = None,
     ) -> Plan:
-        """`solve` from the assembled QP on: `prepare` was called, the arguments are right, and assembling ``began``
-        at that time of `time.perf_counter`."""
+        """`solve` from the assembled QP on: `prepare` was called, and the arguments are right.
+
+        Assembling ``began`` at that time of `time.perf_counter`; ``told`` are the models as the caller has them.
+        """
         assert self._workspace is not None
         n = len(u_previous)
         problem = self.limits, float(dnrm2(qp.P)), float(dnrm2(qp.q))
@@ -216,7 +220,7 @@ class LinearMPC:
         self._last = Plan(
             inputs=inputs,
             states=states,
-            models=models,
+            models=models if told is None else told,
             status=status,
             fallback=fallback,
             active=answer.active,

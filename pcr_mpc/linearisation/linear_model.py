@@ -44,9 +44,13 @@ class LinearModel(Frozen):
 
     @property
     def reach(self) -> float:
-        """How far the balanced tip moves at most when the motors turn [m/rad]: the length by which angles count."""
+        """How far the balanced tip moves at most when the motors turn [m/rad]: the length by which angles count.
+
+        Of a tip that nothing holds, how far it moves in a period.
+        """
         at_rest = np.linalg.lstsq(np.eye(4) - self.A[:4, :4], self.A[:4, 4:], rcond=None)[0]
-        return float(np.linalg.norm(at_rest[:2], 2))
+        found = float(np.linalg.norm(at_rest[:2], 2))
+        return found if found > 0.0 else float(self.dt * np.linalg.norm(self.A[2:4, 4:], 2)) or 1.0
 
     def to_control(self) -> Any:
         """Return the linear part as a `control.StateSpace` with the tip position as output."""

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt, save_figure
+from .style import BLUE, GREEN, GREY, ORANGE, RED, SKY, plt, save_figure
 from .tables import table
 
 _FIGURES = ("p50", "p95", "p99", "p99.9", "max")
-_PART_COLOURS = {"linearise": BLUE, "QP update": SKY, "QP handed over": GREEN, "inside OSQP": ORANGE,
-                 "inside DAQP": ORANGE,
-                 "observer": PURPLE, "rest": GREY}  # fmt: skip
+_PART_COLOURS = {"look ahead": BLUE, "QP update": SKY, "QP handed over": GREEN, "inside OSQP": ORANGE,
+                 "inside DAQP": ORANGE, "rest": GREY}  # fmt: skip
 _BUDGETS_HZ = {"plant step": (1000,), "control step": (100, 200, 500)}
 
 

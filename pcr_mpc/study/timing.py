@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-import time
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from .. import interrupt
+from ..compiled import has_compiler
 from ..loop.feed_forward import feed_forward
 from ..loop.run import Run
 from ..loop.scene import Scene
@@ -137,7 +136,7 @@ def _plants(scene: Scene) -> list[tuple[Plant, str]]:
     common: dict[str, Any] = {"integrator": "velocity_verlet", "dt": 1e-3, "segments": settings.segments,
                               "steps": settings.steps, "scheme": settings.scheme}  # fmt: skip
     plants = [(Plant(scene.robot, method=method, **common), method) for method in methods]
-    if shutil.which("cc"):
+    if has_compiler():
         plants.insert(1, (Plant(scene.robot, method=methods[0], compiled=True, **common), f"{methods[0]}, compiled"))
     return plants
 
@@ -189,27 +188,6 @@ def _force_error(plant: Plant, scene: Scene, run: Run) -> float:
     return worst
 
 
-class _TimedObserver:
-    """An observer that keeps the time of what it does."""
-
-    def __init__(self, observer: Any) -> None:
-        self._observer, self.spent = observer, 0.0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._observer, name)
-
-    def correct(self, *arguments: Any) -> None:
-        self._clocked(self._observer.correct, *arguments)
-
-    def predict(self, *arguments: Any) -> None:
-        self._clocked(self._observer.predict, *arguments)
-
-    def _clocked(self, call: Any, *arguments: Any) -> None:
-        began = time.perf_counter()
-        call(*arguments)
-        self.spent += time.perf_counter() - began
-
-
 def _control_times(
     scene: Scene, run: Run, n: int, label: str | None
 ) -> tuple[Times, dict[str, np.ndarray], np.ndarray]:
@@ -222,28 +200,21 @@ def _control_times(
     assert isinstance(controller, TrackingController)
     states, lap = run.x[:: run.steps_per_period], len(run.u)
     inside = f"inside {SOLVERS[scene.tuning.solver]}"
-    names = ("linearise", "QP update", "QP handed over", inside, "observer", "rest")
+    names = ("look ahead", "QP update", "QP handed over", inside, "rest")
     parts, iterations = np.zeros((n, len(names))), np.zeros(n, dtype=int)
-    observer = _TimedObserver(None)
 
     def restart(k: int) -> None:
-        nonlocal observer
         if k % lap == 0:
             controller.start(run.pose)
-            observer = _TimedObserver(controller.observer)
-            if controller.observer is not None:
-                controller.observer = observer  # type: ignore[assignment]
-        observer.spent = 0.0
 
     def step(k: int) -> None:
         decision = controller.step(k % lap, states[k % lap])
         plan = decision.plan
         assert plan is not None
         parts[k, :4] = (decision.linearise_time, plan.update_time, plan.solve_time - plan.solver_time, plan.solver_time)
-        parts[k, 4] = observer.spent
         iterations[k] = plan.iterations
 
     times = measure(step, n, restart, label)
-    parts[:, 5] = times.wall - parts[:, :5].sum(axis=1)
+    parts[:, 4] = times.wall - parts[:, :4].sum(axis=1)
     parts = parts[WARM_UP:]
     return times, {name: parts[:, i] for i, name in enumerate(names)}, iterations[WARM_UP:]
