@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from pcr_mpc import load_scene, load_tuning
-from pcr_mpc.control.observer import DisturbanceObserver
 from pcr_mpc.control.plan import Plan
 from pcr_mpc.loop.controllers import Decision
 from pcr_mpc.loop.tracking import TrackingController
@@ -35,21 +34,18 @@ def busy(seconds):
 
 @pytest.fixture
 def timed(scene, monkeypatch):
-    """Timing of a controller whose parts say what they took, and whose observer takes half a millisecond twice."""
+    """Timing of a controller whose parts say what they took, and that takes a millisecond besides."""
     steps = []
 
     def step(self, k, x):
         steps.append(k)
-        self.observer.correct(x[:2], x[4:])
-        self.observer.predict(None, None)
+        busy(1e-3)
         iterations = 5 if len(steps) % 2 else 10
         return Decision(np.zeros(2), Plan(np.zeros((1, 2)), None, None, "solved", iterations=iterations,
                                           update_time=2e-6, solve_time=7e-6, solver_time=4e-6), 1e-6)  # fmt: skip
 
-    monkeypatch.setattr(TrackingController, "start", lambda self, pose: setattr(self, "observer", DisturbanceObserver))
+    monkeypatch.setattr(TrackingController, "start", lambda self, pose: None)
     monkeypatch.setattr(TrackingController, "step", step)
-    monkeypatch.setattr(DisturbanceObserver, "correct", lambda *_: busy(5e-4))
-    monkeypatch.setattr(DisturbanceObserver, "predict", lambda *_: busy(5e-4))
     monkeypatch.setattr(timing, "_plants", lambda scene: [])
     monkeypatch.setattr(timing, "call_overhead", lambda *_: [{"name": "graph", "code": "interpreted", "us": 1.25}])
     return timing.time_scene(scene, 60)
@@ -57,15 +53,14 @@ def timed(scene, monkeypatch):
 
 def test_parts_of_a_control_step_have_their_own_names(timed):
     parts = timed["control_parts"]
-    assert list(parts) == ["linearise", "QP update", "QP handed over", "inside OSQP", "observer", "rest"]
-    stated = {"linearise": 1.0, "QP update": 2.0, "QP handed over": 3.0, "inside OSQP": 4.0}
+    assert list(parts) == ["look ahead", "QP update", "QP handed over", "inside OSQP", "rest"]
+    stated = {"look ahead": 1.0, "QP update": 2.0, "QP handed over": 3.0, "inside OSQP": 4.0}
     assert {name: parts[name] for name in stated} == pytest.approx(stated)
-    assert parts["observer"] > 999
-    assert parts["rest"] < parts["observer"]
+    assert parts["rest"] > 980
     components = {one["name"]: one for one in timed["components"]}
     for name, us in stated.items():
         assert (components[name]["p50"], components[name]["n"]) == (pytest.approx(us), 60 - WARM_UP)
-    assert components["control step"]["p50"] >= components["observer"]["p50"]
+    assert components["control step"]["p50"] >= components["rest"]["p50"]
     assert {row["iterations"] for row in timed["iterations"]} == {5, 10}
     assert "control step between plant steps" in components
 
@@ -73,7 +68,7 @@ def test_parts_of_a_control_step_have_their_own_names(timed):
 def test_timing_in_words_has_units_budgets_and_shares(timed):
     text = timing_tables(timed)
     rows = {line.split("  ")[0].strip(): line for line in text.splitlines()}
-    assert rows["linearise"].split()[-3:] == ["1.0", "0", "%"]
+    assert rows["look ahead"].split()[-3:] == ["1.0", "0", "%"]
     for words in ("wall time [us]", "deadlines missed", "100 Hz", "200 Hz", "500 Hz", "QP iterations", "mean [us]",
                   "relative error of F along the run", "casadi"):  # fmt: skip
         assert words in text
