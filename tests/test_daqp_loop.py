@@ -25,6 +25,7 @@ from pcr_mpc.control.osqp_solver import QPSolver
 from pcr_mpc.control.qp import build_qp
 from pcr_mpc.control.tuning import Limits
 from pcr_mpc.linearisation.linear_limits import LinearLimits
+from pcr_mpc.linearisation.linear_model import LinearModels
 from pcr_mpc.study.tuning_file import write_tuning
 
 from .conftest import CONTROLLERS, MODELS
@@ -102,15 +103,17 @@ def test_limits_of_poses_and_angles_against_osqp(target, model, pair):
     limits = LinearLimits(("torque",) * 3, rows, value - 0.01, value + 0.01, np.ones(3))
     reference = Reference(np.tile(target, (TUNING.horizon, 1)), np.zeros((TUNING.horizon, 2)))
     kinds = limits.kinds
-    ours = LimitedQP(replace(TUNING, tolerance=1e-9), 2, DT, kinds)
-    others = LimitedQP(replace(TUNING, tolerance=1e-10, max_iterations=200_000, solver="osqp"), 2, DT, kinds)
+    ours = LimitedQP(replace(TUNING, tolerance=1e-9), 2, DT, kinds, reach=model.reach)
+    others = LimitedQP(
+        replace(TUNING, tolerance=1e-10, max_iterations=200_000, solver="osqp"), 2, DT, kinds, reach=model.reach
+    )
     slacks = 0
     for k in range(6):
         x = target + np.array([0.02, -0.01, 0.1, 0.0, 0.03, -0.02]) * rng.normal(size=6)
         stops = target[4:] + 0.03 if k < 3 else x[4:] - 0.001  # beyond the stop
         motors = Limits(6.0, 1.0, target[4:] - 0.2, stops)
         qp = build_qp(x, model, reference, np.zeros(2), TUNING, motors, terminal_weight(model, TUNING))
-        first, second = (one.solve(qp, x, [model], limits, soft_angles=True) for one in (ours, others))
+        first, second = (one.solve(qp, x, LinearModels.of([model]), limits, soft_angles=True) for one in (ours, others))
         assert first.inputs == pytest.approx(second.inputs, abs=1e-4)
         assert first.active == second.active
         assert first.slack == pytest.approx(second.slack, rel=1e-4, abs=1e-6)
@@ -128,8 +131,8 @@ def test_the_closed_loop_is_that_of_osqp(name, monkeypatch):
             self.given = arguments
             super().update(*arguments)
 
-        def solve(self, most=None):
-            solution = super().solve(most)
+        def solve(self, most=None, **options):
+            solution = super().solve(most, **options)
             seen.append((self._matrix, self.given, solution))
             return solution
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import casadi as ca
 
+from ..buffered import graph_cache
 from ..control.observer import correction
 from ..linearisation.linearise import STIFFEST
 from ..linearisation.model_graph import force_graph, model_graph, sizes
@@ -51,6 +52,7 @@ class Places:
         return self.delay + self.models
 
 
+@graph_cache(maxsize=16)
 def foresight_graph(model: StepModel, target: StepModel, places: Places, condense: Any | None) -> Any:
     """Build the graph.
 
