@@ -128,7 +128,7 @@ def test_the_closed_loop_is_that_of_osqp(name, monkeypatch):
 
     class Recorded(DAQPSolver):
         def update(self, *arguments):
-            self.given = arguments
+            self.given = [np.array(each) for each in arguments]  # they are overwritten
             super().update(*arguments)
 
         def solve(self, most=None, **options):
