@@ -14,7 +14,7 @@ from ..plant import elastica
 from ..plant.chart import LEAST_CRITICAL_LOAD, critical_load, critical_load_slope, rough_critical_load
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
-from ..plant.rod_state import RobotState
+from ..plant.robot_state import RobotState
 from .linear_limits import KINDS, LinearLimits
 
 # How close to a limit a pose must come before the limit is linearised: its controller then looks a horizon ahead.

@@ -17,8 +17,8 @@ from .numbers import Kind
 from .plant_choices import ON_SNAP, checked_choices
 from .quick_step import QuickStep
 from .robot import Robot
+from .robot_state import RobotState
 from .rod_solver import RodSolver, Snap
-from .rod_state import RobotState
 from .statics import checked_shooting, make_solver
 from .step_graph import LARGEST_DRIFT, PREDICTOR_ACCURACY, StepModel
 from .step_limit import longest_step

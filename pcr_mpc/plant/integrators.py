@@ -16,20 +16,37 @@ dt |v| / L times the rods' share of the mass solves it to rounding.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 
 from ..buffered import BufferedFunction, graph_cache
-
-if TYPE_CHECKING:
-    from .dynamics import Plant
+from .mass_matrix import MassMatrix
+from .robot import Robot
 
 # Each gains four digits or more.
 _ITERATIONS = 3
 # Where the next stage of RK4 is, and how much this one counts, in steps.
 RK4_STAGES = ((1 / 2, 1 / 6), (1 / 2, 1 / 3), (1.0, 1 / 3), (0.0, 1 / 6))
+
+
+class Weighed(Protocol):
+    """What the schemes ask of a plant."""
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+
+    @property
+    def dt(self) -> float:
+        """Step [s]."""
+
+    def mass(self, p: np.ndarray, q: np.ndarray) -> MassMatrix:
+        """Mass matrix at (p, q) and its slopes."""
+
+    def force_and_mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, MassMatrix]:
+        """Force of the rods at (p, q), and `mass`."""
 
 
 class _Symbols:
@@ -129,7 +146,7 @@ class _Graph(BufferedFunction):
         super().__init__(function)
         self._held: object = None
 
-    def load(self, plant: Plant, p: np.ndarray, q: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> None:
+    def load(self, plant: Weighed, p: np.ndarray, q: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> None:
         """Write what is known at (p, q)."""
         inputs = self.inputs
         force, mass = plant.force_and_mass(p, q)
@@ -154,7 +171,7 @@ class SemiImplicitEuler:
     def __init__(self, n: int) -> None:
         self._step, self._stop = _Graph(euler_graph(n)), _Graph(stop_graph(n))
 
-    def __call__(self, plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
+    def __call__(self, plant: Weighed, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         """Advance by one step."""
         step, stop = self._step, self._stop
         step.load(plant, x[:2], x[4:], rate, f_ext)
@@ -177,7 +194,7 @@ class VelocityVerlet:
     def __init__(self, n: int) -> None:
         self._first, self._second = _Graph(first_half_graph(n)), _Graph(second_half_graph(n))
 
-    def __call__(self, plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
+    def __call__(self, plant: Weighed, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         """Advance by one step."""
         first, second = self._first, self._second
         first.load(plant, x[:2], x[4:], rate, f_ext)
@@ -195,7 +212,7 @@ class RK4:
     def __init__(self, n: int) -> None:
         self._stage, self._stop = _Graph(stage_graph(n)), _Graph(stop_graph(n))
 
-    def __call__(self, plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
+    def __call__(self, plant: Weighed, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         """Advance by one step."""
         stage, stop, dt = self._stage, self._stop, plant.dt
         y, start, total, factors = stage.inputs[5:]

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from .distributed import DistributedRods, ModalState
+from .equilibrium import Equilibrium
+from .mass_matrix import MassMatrix
 from .robot import Robot
 
-if TYPE_CHECKING:
-    from .dynamics import Plant
+
+class Balanced(Protocol):
+    """What the step asks of a plant."""
+
+    @property
+    def dt(self) -> float:
+        """Step [s]."""
+
+    def equilibrium(self, x: np.ndarray) -> Equilibrium:
+        """Everything about the rods at rest at state x."""
+
+    def mass(self, p: np.ndarray, q: np.ndarray) -> MassMatrix:
+        """Mass matrix at (p, q) and its slopes."""
 
 
 class ModalStep:
@@ -34,7 +47,7 @@ class ModalStep:
         """Start with rods in equilibrium."""
         self._last = None
 
-    def pick_up(self, plant: Plant, mass: float, x: np.ndarray) -> np.ndarray | None:
+    def pick_up(self, plant: Balanced, mass: float, x: np.ndarray) -> np.ndarray | None:
         """State after a mass at rest has joined the tip at x; None if the rods have no state there yet."""
         if self._last is None or (x != self._last[0]).any():
             return None
@@ -43,7 +56,7 @@ class ModalStep:
         self._last = end.copy(), state
         return end
 
-    def __call__(self, plant: Plant, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
+    def __call__(self, plant: Balanced, x: np.ndarray, rate: np.ndarray, f_ext: np.ndarray) -> np.ndarray:
         """Advance by one step."""
         if self._last is not None and (x == self._last[0]).all():
             state = self._last[1]
@@ -55,7 +68,7 @@ class ModalStep:
         return end
 
     @staticmethod
-    def _seen(plant: Plant, state: ModalState) -> np.ndarray:
+    def _seen(plant: Balanced, state: ModalState) -> np.ndarray:
         """State of the plant, with the tip's velocity once the motors stop and the rods have calmed down."""
         mass, _ = plant.mass(state.p, state.q)
         v = state.v + np.linalg.solve(mass[:2, :2], mass[:2, 2:] @ state.u)

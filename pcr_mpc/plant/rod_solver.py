@@ -13,10 +13,11 @@ from ..errors import ConvergenceError, PCRError, UnstableError
 from .equilibrium import Equilibrium
 from .numbers import Kind
 from .robot import Robot
+from .robot_state import RobotState
 from .rod_follower import BRANCH_CHANGE, BranchEnds, NotConverged, RodFollower
 from .rod_method import RodMethod, enough_nodes, warm_step
 from .rod_physics import in_layout, require_plain
-from .rod_state import RobotState, RodState
+from .rod_state import RodState
 
 # Residual beyond which another iteration is not worth trying.
 ROUGH = 1e-4
