@@ -21,6 +21,7 @@ from typing import Any
 
 import casadi as ca
 
+from .buffered import graph_cache
 from .errors import CompilerError
 
 # Without -ffast-math the results are those of the interpreter, bit for bit. -O2 takes half as long again to build, and
@@ -35,8 +36,20 @@ def has_compiler() -> bool:
 
 
 def fastest(function: Any, wanted: bool = True) -> Any:
-    """Return the function compiled if that is wanted and there is a compiler, else as it is: the same numbers."""
-    return compiled(function) if wanted and has_compiler() else function
+    """Return the function compiled if that is wanted and can be had, else as it is: the same numbers."""
+    if not wanted or not has_compiler():
+        return function
+    try:
+        return _once(function, *_compiler(), os.environ.get("XDG_CACHE_HOME", ""))
+    except CompilerError as error:
+        print(f"{error}; interpreted meanwhile", file=sys.stderr)
+        return function
+
+
+@graph_cache(maxsize=64)
+def _once(function: Any, *environment: str) -> Any:
+    """Machine code of a function, remembered: to look it up in the cache takes a good part of a second."""
+    return compiled(function)
 
 
 def compiled(function: Any) -> Any:
