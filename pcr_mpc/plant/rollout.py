@@ -92,7 +92,7 @@ def rollout(
     if plant.step_model is None:
         raise ValueError(f"method {plant.method!r} with inertia {plant.inertia!r} has no rollout; use Plant.step")
     threads = checked_integer("threads", threads)
-    starts, inputs, f_ext, many = _checked(plant, x0, inputs, f_ext, robots)
+    starts, inputs, f_ext, many = checked_motion(plant, x0, inputs, f_ext, robots)
     count, steps = inputs.shape[:2]
     plants = [plant] * count if robots is None else [_alike(plant, i, robot) for i, robot in enumerate(robots)]
     x, residual = np.empty((count, steps + 1, plant.n_states)), np.empty((count, steps))
@@ -116,8 +116,8 @@ def rollout(
     return Rollout(t, x if many else x[0], residual if many else residual[0], tuple(stepped))
 
 
-def _checked(
-    plant: Plant, x0: Any, inputs: Any, f_ext: Any, different: Sequence[Robot] | None
+def checked_motion(
+    plant: Plant, x0: Any, inputs: Any, f_ext: Any, different: Sequence[Robot] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
     """Arguments with all their axes, and whether there is one of robots."""
     x0, inputs, f_ext = np.asarray(x0), np.asarray(inputs), np.asarray(f_ext)
@@ -160,7 +160,7 @@ def _memories(plants: list[Plant], starts: np.ndarray, guess: Equilibrium | None
     found: dict[tuple[Plant, bytes], np.ndarray] = {}
     for i, (plant, x) in enumerate(zip(plants, starts, strict=True)):
         if (plant, x.tobytes()) not in found:
-            with _said_of(plant, i, 0, x):
+            with said_of(plant, i, 0, x):
                 plant.reset(x, guess)
                 found[plant, x.tobytes()] = plant.memory(x)
     return np.stack([found[plant, x.tobytes()] for plant, x in zip(plants, starts, strict=True)])
@@ -219,17 +219,17 @@ def _stepped(
     """States and residuals of one robot by `Plant.step`."""
     x, residual = np.empty((len(inputs) + 1, len(start))), np.empty(len(inputs))
     x[0] = start
-    with _said_of(plant, robot, 0, start):
+    with said_of(plant, robot, 0, start):
         plant.reset(start, guess)
     for step in range(len(inputs)):
-        with _said_of(plant, robot, step, x[step]):
+        with said_of(plant, robot, step, x[step]):
             x[step + 1] = plant.step(x[step], inputs[step], f_ext[step])
         residual[step] = plant.residual
     return x, residual
 
 
 @contextmanager
-def _said_of(plant: Plant, robot: int, step: int, x: np.ndarray) -> Iterator[None]:
+def said_of(plant: Plant, robot: int, step: int, x: np.ndarray) -> Iterator[None]:
     """Errors say which robot it was, and when."""
     try:
         yield

@@ -23,6 +23,8 @@ from .weight import robot_weight
 
 # Newton iterations for a force, to be tried in this order.
 CORRECTIONS = (1, 2)
+# Poses that a step of each integrator moves the rods to.
+SOLVES = {"semi_implicit_euler": 1, "velocity_verlet": 1, "rk4": 4}
 # A simulation uses the derivatives only to predict the next pose.
 PREDICTOR_ACCURACY = 1e-2
 # Relative drift of a rod's invariant beyond which its force may be off by per cents.
