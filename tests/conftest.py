@@ -56,6 +56,14 @@ def bent(general: Robot) -> Equilibrium:
 
 
 @pytest.fixture(scope="session")
+def knotted(general: Robot) -> Robot:
+    """General rods that both stretch, with as many values along them as there are knots."""
+    rods = general.rods
+    other = replace(rods[1], curvature=(-0.8, -0.9, -0.7), stiffness_factors=(1.0, 0.9, 0.8), axial_stiffness=7e3)
+    return replace(general, rods=(rods[0], other))
+
+
+@pytest.fixture(scope="session")
 def inextensible(general: Robot) -> Robot:
     """The general rods but for their stretch."""
     return replace(general, rods=tuple(replace(rod, axial_stiffness=np.inf) for rod in general.rods))

@@ -106,14 +106,6 @@ def test_differences_for_three_rods():
 COARSE = {"segments": 3, "scheme": "rk4", "steps": 2}
 
 
-@pytest.fixture
-def knotted(general):
-    """General rods with as many values as there are knots, which both stretch."""
-    rods = general.rods
-    other = replace(rods[1], curvature=(-0.8, -0.9, -0.7), stiffness_factors=(1.0, 0.9, 0.8), axial_stiffness=7e3)
-    return replace(general, rods=(rods[0], other))
-
-
 @pytest.mark.parametrize(
     "integrator", ["semi_implicit_euler", "velocity_verlet", pytest.param("rk4", marks=pytest.mark.slow)]
 )
