@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import time
 from collections.abc import Callable
 from functools import partial
@@ -13,6 +12,7 @@ import numpy as np
 
 from .. import interrupt
 from ..buffered import BufferedFunction
+from ..compiled import has_compiler
 from ..errors import CompilerError
 from ..plant.dynamics import Plant
 from ..plant.equilibrium import Equilibrium
@@ -36,7 +36,7 @@ def call_overhead(robot: Robot, pose: Equilibrium) -> list[dict[str, Any]]:
         time of the fastest of many batches, which others on the machine hardly change.
     """
     rows = []
-    for compiled in (False, True) if shutil.which("cc") else (False,):
+    for compiled in (False, True) if has_compiler() else (False,):
         plant = Plant(robot, integrator="velocity_verlet", dt=1e-3, compiled=compiled)
         x = np.concatenate([pose.p, (0.05, -0.05), pose.q])
         plant.reset(x, pose)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from dataclasses import replace
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .. import interrupt
+from ..compiled import has_compiler
 from ..loop.feed_forward import feed_forward
 from ..loop.run import Run
 from ..loop.scene import Scene
@@ -105,7 +105,7 @@ def _plants(scene: Scene) -> list[tuple[Plant, str]]:
     common: dict[str, Any] = {"integrator": "velocity_verlet", "dt": 1e-3, "segments": settings.segments,
                               "steps": settings.steps, "scheme": settings.scheme}  # fmt: skip
     plants = [(Plant(scene.robot, method=method, **common), method) for method in methods]
-    if shutil.which("cc"):
+    if has_compiler():
         plants.insert(1, (Plant(scene.robot, method=methods[0], compiled=True, **common), f"{methods[0]}, compiled"))
     return plants
 
