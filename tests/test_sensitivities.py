@@ -129,6 +129,18 @@ def test_shooting_and_closed_form_agree(pair, centre):
     assert_close(results[1], results[0], 1e-7)
 
 
+def test_where_two_iterations_are_too_little(pair, centre):
+    """A fast tip by long steps (see test_rollout)."""
+    plant = Plant(pair, integrator="velocity_verlet", weight="none", dt=4e-3)
+    x0, steps = start_at(centre, (2.0, -3.0)), 20
+    moved = rollout(plant, x0, np.zeros((steps, 2)), guess=centre)
+    assert moved.stepped == (0,)
+    found = sensitivities(plant, x0, np.zeros((steps, 2)), guess=centre)
+    assert found.x == pytest.approx(moved.x, abs=1e-10)
+    by_differences, sizes = differences(plant, x0, np.zeros((steps, 2)), (0.0, 0.0), centre)
+    assert_close(found.dx_dnumbers * sizes, by_differences, 1e-5)
+
+
 def test_small_oscillations_in_closed_form(pair, centre):
     """About rest the motion is linear: m v' = -K dp - G dq - c v, and its derivatives are matrix exponentials."""
     robot, dt, steps = replace(pair, drag=0.5), 5e-4, 100

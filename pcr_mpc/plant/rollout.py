@@ -141,11 +141,13 @@ def checked_motion(
 
 def _alike(plant: Plant, index: int, robot: Robot) -> Plant:
     """Plant of another robot of the same kind."""
+    if not isinstance(robot, Robot):
+        raise TypeError(f"robots[{index}] is a {type(robot).__name__}, expected a Robot")
     other = plant.of(robot)
     if other.step_model != plant.step_model:
         raise ValueError(
             f"robots[{index}] ({robot.name}) is of another kind than {plant.robot.name}: {_described(other)}, expected "
-            f"{_described(plant)}; give it a rollout of its own"
+            f"{_described(plant)}; name a method and a weight that do for both, or give it a rollout of its own"
         )
     return other
 
