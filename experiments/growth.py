@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from tqdm import tqdm
 
 from pcr_mpc import Equilibrium, Plant, Robot, Scene, inverse_statics, load_robot, load_scene, rollout, solve_statics
 from pcr_mpc.buffered import BufferedFunction
+from pcr_mpc.compiled import has_compiler
 from pcr_mpc.control.tuning import Tuning, load_tuning
 from pcr_mpc.loop.simulate import simulate
 from pcr_mpc.loop.tracking import make_controller
@@ -32,7 +32,7 @@ from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, plt
 from pcr_mpc.study.machine import machine
 
-CODES = ("interpreted", "compiled") if shutil.which("cc") else ("interpreted",)
+CODES = ("interpreted", "compiled") if has_compiler() else ("interpreted",)
 CENTRE, RADIUS, BOW = (0.0, 0.25), 0.27, 2.177  # m, m, and angle of a rod's motor from the direction to the tip [rad]
 
 

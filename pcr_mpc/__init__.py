@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from .plant.free_tip import forward_statics, inverse_statics
     from .plant.robot import Robot, Rod, load_robot
     from .plant.rollout import Rollout, rollout
+    from .plant.sensitivities import Sensitivities, sensitivities
     from .plant.stability import Stability, all_equilibria, assess_stability, distance_to_fold
     from .plant.statics import solve_statics
 
@@ -60,6 +61,7 @@ __all__ = [
     "Rollout",
     "Run",
     "Scene",
+    "Sensitivities",
     "SimulationError",
     "Stability",
     "TrackingController",
@@ -80,6 +82,7 @@ __all__ = [
     "load_tuning",
     "make_controller",
     "rollout",
+    "sensitivities",
     "simulate",
     "solve_statics",
 ]
@@ -113,6 +116,7 @@ _WHERE = {
     "plant.free_tip": ("forward_statics", "inverse_statics"),
     "plant.robot": ("Robot", "Rod", "load_robot"),
     "plant.rollout": ("Rollout", "rollout"),
+    "plant.sensitivities": ("Sensitivities", "sensitivities"),
     "plant.stability": ("Stability", "all_equilibria", "assess_stability", "distance_to_fold"),
     "plant.statics": ("solve_statics",),
 }

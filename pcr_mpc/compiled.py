@@ -1,14 +1,15 @@
 """CasADi functions as machine code, where there is a C compiler: a third of the time of CasADi's own interpreter.
 
 What is built is kept in the user's cache folder, ``$XDG_CACHE_HOME/pcr_mpc`` or ``~/.cache/pcr_mpc``, under a name made
-of the source, the compiler, its flags, and the library's own digest: a change of any of them builds anew, two processes
-that build at once do not meet, and a file that is not what its name says is not loaded.
+of the source, the machine, the compiler, its flags, and the library's own digest: a change of any of them builds anew,
+two processes that build at once do not meet, and a file that is not what its name says is not loaded.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import shlex
 import shutil
 import stat
@@ -60,45 +61,63 @@ def compiled(function: Any) -> Any:
     CompilerError
         There is no compiler, or it failed.
     """
+    if not has_compiler():
+        raise _failure(function.name(), "there is no such compiler")
     generator = ca.CodeGenerator(f"{function.name()}.c")
     generator.add(function)
     source = generator.dump()
-    key = _digest("\0".join([source, _version(), *_compiler(), *_FLAGS]).encode())
+    key = _digest("\0".join([source, platform.machine(), _version(), *_compiler(), *_FLAGS]).encode())
     cache = _cache()
     library = None if cache is None else _found(cache, key)
     if library is not None:
-        return ca.external(function.name(), str(library))
+        return _loaded(function.name(), library)
     # Of a cache that others could write to, or that cannot be written at all, nothing is used.
-    with tempfile.TemporaryDirectory(dir=cache) as folder:
-        built = _built(function.name(), source, Path(folder))
-        if cache is None:
-            return ca.external(function.name(), str(built))
-        library = cache / f"{key}-{_digest(built.read_bytes())}.so"
-        os.replace(built, library)
-    return ca.external(function.name(), str(library))
+    try:
+        with tempfile.TemporaryDirectory(dir=cache) as folder:
+            library = _built(function.name(), source, Path(folder))
+            if cache is None:
+                return _loaded(function.name(), library)
+            place = cache / f"{key}-{_digest(library.read_bytes())}.so"
+            os.replace(library, place)
+    except OSError as error:  # no room left, for one
+        raise _failure(function.name(), str(error)) from None
+    return _loaded(function.name(), place)
 
 
 def _built(name: str, source: str, folder: Path) -> Path:
-    command = _compiler()
     path, library = folder / f"{name}.c", folder / f"{name}.so"
     path.write_text(source)
     print(f"building machine code of {name!r} ({len(source) // 1000} kB of C), once", file=sys.stderr)
-    try:
-        subprocess.run(
-            [*command, *_FLAGS, str(path), "-o", str(library), "-lm"], check=True, capture_output=True, text=True
-        )
-    except (OSError, subprocess.CalledProcessError, IndexError) as error:
-        said = str(getattr(error, "stderr", "") or error).strip()
-        raise CompilerError(
-            f"cannot compile {name} with {' '.join(command)!r}: {said}; set CC to a C compiler, "
-            "or do without compiled=True",
-            command=command,
-        ) from None
+    command = [*_compiler(), *_FLAGS, str(path), "-o", str(library), "-lm"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, errors="replace")
+    if done.returncode or not library.is_file():
+        raise _failure(name, done.stderr.strip() or f"it ended with status {done.returncode} and said nothing")
+    library.chmod(0o700)  # whatever the umask
     return library
 
 
+def _loaded(name: str, library: Path) -> Any:
+    try:
+        return ca.external(name, str(library))
+    except RuntimeError as error:  # where nothing may be run, for one
+        raise _failure(name, str(error).strip().splitlines()[-1]) from None
+
+
+def _failure(name: str, reason: str) -> CompilerError:
+    command = _compiler()
+    return CompilerError(
+        f"cannot compile {name} with {shlex.join(command)!r}: {reason}; set CC to a C compiler, or to nothing to do "
+        "without machine code",
+        command=command,
+    )
+
+
 def _compiler() -> list[str]:
-    return shlex.split(os.environ.get("CC", "cc"))
+    command = os.environ.get("CC", "cc")
+    try:
+        return shlex.split(command)
+    except ValueError:  # a quotation that does not end
+        return [command]
 
 
 def _version() -> str:
@@ -109,7 +128,9 @@ def _version() -> str:
 @lru_cache
 def _version_of(*command: str) -> str:
     try:
-        return subprocess.run([*command, "--version"], capture_output=True, text=True, check=False).stdout
+        return subprocess.run(
+            [*command, "--version"], check=False, capture_output=True, text=True, errors="replace"
+        ).stdout
     except OSError:
         return ""
 
@@ -121,31 +142,42 @@ def _digest(data: bytes) -> str:
 def _found(cache: Path, key: str) -> Path | None:
     """Return the library under ``key``, if it is whole and nobody else could have written it."""
     for path in sorted(cache.glob(f"{key}-*.so")):
-        if _private(path) and _digest(path.read_bytes()) == path.stem.removeprefix(f"{key}-"):
-            return path
-        path.unlink(missing_ok=True)
+        try:
+            if _private(path) and _digest(path.read_bytes()) == path.stem.removeprefix(f"{key}-"):
+                return path
+            path.unlink()
+        except OSError:  # another process was faster to remove it, or it is no file at all
+            continue
     return None
 
 
 def _cache() -> Path | None:
     """Return the cache folder, made if need be; None where it cannot be written, or others could write to it."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pcr_mpc"
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError:
+        # As the XDG base directory specification has it, a path that is not absolute does not count.
+        given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        folder = (given if given.is_absolute() else Path.home() / ".cache") / "pcr_mpc"
+        for missing in reversed([one for one in (folder, *folder.parents) if not one.exists()]):
+            missing.mkdir(mode=0o700, exist_ok=True)
+        folder = folder.resolve()
+        safe = _private(folder) and os.access(folder, os.W_OK) and all(map(_guarded, folder.parents))
+    except (OSError, RuntimeError):  # RuntimeError: there is no home
         return None
-    safe = _private(folder) and os.access(folder, os.W_OK) and all(_guarded(parent) for parent in folder.parents)
     return folder if safe else None
 
 
 def _private(path: Path) -> bool:
     """Whether it is mine, and nobody else can write to it."""
     found = path.lstat()
-    mine = not hasattr(os, "getuid") or found.st_uid == os.getuid()
-    return mine and not stat.S_ISLNK(found.st_mode) and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return _mine(found) and not stat.S_ISLNK(found.st_mode) and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def _guarded(folder: Path) -> bool:
-    """Whether nobody but its owner can put something else in the place of what is in it."""
-    mode = folder.stat().st_mode
-    return not mode & (stat.S_IWGRP | stat.S_IWOTH) or bool(mode & stat.S_ISVTX)
+    """Whether nobody but me and the administrator can put something else in the place of what is in it."""
+    found = folder.stat()
+    shared = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not found.st_mode & stat.S_ISVTX
+    return (_mine(found) or found.st_uid == 0) and not shared
+
+
+def _mine(found: os.stat_result) -> bool:
+    return not hasattr(os, "getuid") or found.st_uid == os.getuid()

@@ -1,3 +1,6 @@
+import os
+import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +13,25 @@ ROOT = Path(__file__).parent.parent
 MODELS = ROOT / "models"
 CONTROLLERS = ROOT / "controllers"
 DATA = Path(__file__).parent / "data"
+# Nothing is compiled, by subprocesses neither, but in tests that ask for the compiler.
+COMPILER = os.environ.get("CC", "cc")
+os.environ["CC"] = ""
+
+
+@pytest.fixture(scope="session")
+def machine_code(tmp_path_factory) -> Path:
+    """Cache folder of this test run."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def compiler(monkeypatch, machine_code) -> str:
+    """The machine's C compiler."""
+    if not COMPILER or shutil.which(shlex.split(COMPILER)[0]) is None:
+        pytest.skip("no C compiler")
+    monkeypatch.setenv("CC", COMPILER)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(machine_code))
+    return COMPILER
 
 
 @pytest.fixture(scope="session")
@@ -53,6 +75,14 @@ def general(pair: Robot) -> Robot:
 @pytest.fixture(scope="session")
 def bent(general: Robot) -> Equilibrium:
     return solve_statics(general, (0.01, 0.24), (3.2, 0.1))
+
+
+@pytest.fixture(scope="session")
+def knotted(general: Robot) -> Robot:
+    """General rods that both stretch, with as many values along them as there are knots."""
+    rods = general.rods
+    other = replace(rods[1], curvature=(-0.8, -0.9, -0.7), stiffness_factors=(1.0, 0.9, 0.8), axial_stiffness=7e3)
+    return replace(general, rods=(rods[0], other))
 
 
 @pytest.fixture(scope="session")

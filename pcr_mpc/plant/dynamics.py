@@ -129,6 +129,7 @@ class Plant(Remade):
         self._sag = CondensedWeight(robot) if weight == "condensed" else None
         self._at: list[float] | None = None
         self._accuracy = 0.0  # of the derivatives there
+        self._stiffness: np.ndarray | None = None  # at the last reset
         self._mass = tip_mass(robot)
         self._mass_at: list[float] | None = None
         self.payload = 0.0
@@ -301,6 +302,8 @@ class Plant(Remade):
     def _step_too_long(self) -> str | None:
         """Whether the integrator is unstable on the stiffness of the rods at the reset, in words."""
         # Not where they are: a tip that was thrown away has pulled them taut.
+        if self._stiffness is None:
+            return None
         longest, omega = longest_step(self.integrator, self._stiffness, self._mass[0][:2, :2], self.robot.drag)
         if self.dt < longest:
             return None

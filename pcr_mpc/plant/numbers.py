@@ -13,9 +13,17 @@ from .robot import Robot
 from .rod import Layout
 from .rod_physics import at_knots, normalised, robot_layout
 
-# Of each rod in turn, then of the robot, in SI units; a rod that is not plain adds 1/EA and its values at the knots.
-_OF_ROD = ("bending_stiffness", "length", "base_x", "base_y", "line_density", "angle_lower", "angle_upper")
-_OF_ROBOT = ("tip_mass", "drag", "gravity_x", "gravity_y", "rate_limit")
+# Of each rod in turn, then of the robot, with their units; what a rod that is not plain has more is listed in `Kind`.
+_OF_ROD = {
+    "bending_stiffness": "N m^2",
+    "length": "m",
+    "base_x": "m",
+    "base_y": "m",
+    "line_density": "kg/m",
+    "angle_lower": "rad",
+    "angle_upper": "rad",
+}
+_OF_ROBOT = {"tip_mass": "kg", "drag": "N s/m", "gravity_x": "m/s^2", "gravity_y": "m/s^2", "rate_limit": "rad/s"}
 
 
 @dataclass(frozen=True)
@@ -51,20 +59,43 @@ class Kind:
     n_rods : int
     layout : Layout or None
         Of what the rods have beyond plain ones; None: they are plain.
+
+    Notes
+    -----
+    The vector holds, for each rod i in turn, ``rods[i].`` and
+
+    ======================== ======= =====================================================
+    bending_stiffness        N m^2   EI
+    length                   m       L
+    base_x, base_y           m
+    line_density             kg/m
+    angle_lower, angle_upper rad     stops of its motor
+    axial_compliance         1/N     1/EA, if the layout stretches; 0 for a rod that does not
+    curvature[j]             1/m     kappa0 at knot j of the layout, if there is one
+    stiffness_factors[j]     -       EI(s)/EI at knot j, if the layout varies
+    ======================== ======= =====================================================
+
+    and then, of the robot, tip_mass [kg], drag [N s/m], gravity_x, gravity_y [m/s^2], rate_limit [rad/s].
     """
 
     n_rods: int
     layout: Layout | None = None
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the numbers, in their order: ``rods[0].bending_stiffness`` [N m^2] to ``rate_limit`` [rad/s]."""
-        of_rod = list(_OF_ROD)
+    def units(self) -> dict[str, str]:
+        """Units of the numbers by their names, in their order."""
+        of_rod = dict(_OF_ROD)
         if self.layout is not None:
             knots = range(self.layout.intervals + 1)
-            of_rod += ["axial_compliance", *(f"curvature[{j}]" for j in knots)]
-            of_rod += [f"stiffness_factors[{j}]" for j in knots] if self.layout.varying else []
-        return (*(f"rods[{i}].{name}" for i in range(self.n_rods) for name in of_rod), *_OF_ROBOT)
+            of_rod |= {"axial_compliance": "1/N"} if self.layout.stretching else {}
+            of_rod |= {f"curvature[{j}]": "1/m" for j in knots}
+            of_rod |= {f"stiffness_factors[{j}]": "-" for j in knots} if self.layout.varying else {}
+        return {f"rods[{i}].{name}": unit for i in range(self.n_rods) for name, unit in of_rod.items()} | _OF_ROBOT
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the numbers, in their order."""
+        return tuple(self.units)
 
     @property
     def size(self) -> int:
@@ -72,7 +103,7 @@ class Kind:
         return len(self.names)
 
     def pack(self, robot: Robot) -> np.ndarray:
-        """Numbers of a robot of this kind, shape (size,), in SI units; 1/EA [1/N] is 0 for a rod that does not stretch.
+        """Numbers of a robot of this kind, shape (size,), in SI units.
 
         Raises
         ------
@@ -90,7 +121,8 @@ class Kind:
         for rod in robot.rods:
             values += [rod.bending_stiffness, rod.length, *rod.base, rod.line_density, *rod.angle_limits]
             if self.layout is not None:
-                values += [1.0 / rod.axial_stiffness, *at_knots(rod.curvatures, self.layout.intervals)]
+                values += [1.0 / rod.axial_stiffness] if self.layout.stretching else []
+                values += at_knots(rod.curvatures, self.layout.intervals).tolist()
                 if self.layout.varying:
                     values += at_knots(rod.stiffness_factors, self.layout.intervals).tolist()
         return read_only(np.array([*values, robot.tip_mass, robot.drag, *robot.gravity, robot.rate_limit]))
@@ -109,9 +141,11 @@ class Kind:
             stiffness, length, density = own[0], own[1], own[4]
             physics: tuple[Any, ...] = ()
             if self.layout is not None:
-                knots = 8 + self.layout.intervals + 1
-                factors = own[knots:]
-                physics = (ca.vertcat(*normalised(stiffness, length, density, gravity, own[7], own[8:knots], factors)),)
+                first = len(_OF_ROD) + self.layout.stretching
+                compliance = own[first - 1] if self.layout.stretching else 0.0
+                curvature, factors = ca.vertsplit(own[first:], [0, self.layout.intervals + 1, width - first])
+                values = normalised(stiffness, length, density, gravity, compliance, curvature, factors)
+                physics = (ca.vertcat(*values),)
             rods.append(RodNumbers(stiffness, length, own[2:4], density, physics))
             lower.append(own[5])
             upper.append(own[6])

@@ -9,9 +9,7 @@ import numpy as np
 
 from ..buffered import BufferedFunction
 from .rod_solver import ROUGH, RodSolver
-from .step_graph import CORRECTIONS, StepModel, limits, step_function
-
-_SOLVES = {"semi_implicit_euler": 1, "velocity_verlet": 1, "rk4": 4}
+from .step_graph import CORRECTIONS, SOLVES, StepModel, limits, step_function
 
 
 class QuickStep:
@@ -31,7 +29,7 @@ class QuickStep:
     def __init__(self, model: StepModel, solver: RodSolver, numbers: np.ndarray, *, compiled: bool) -> None:
         self.model, self._solver, self._compiled = model, solver, compiled
         self._limits = limits(model)
-        self._solves = _SOLVES[model.integrator]
+        self._solves = SOLVES[model.integrator]
         self._n, self._numbers = model.kind.n_rods, numbers
         # Two for each number of corrections, so that a step that fails leaves the last pose whole.
         self._graphs = {CORRECTIONS[0]: self._pair(CORRECTIONS[0])}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,8 +75,8 @@ def rollout(
     guess : Equilibrium, optional
         On whose branch the rods start; None: on that of least energy.
     robots : sequence of R Robot, optional
-        Robots that differ from the plant's, and from each other, in their numbers only (see `Kind`). None: all are the
-        plant's.
+        Robots that differ from the plant's, and from each other, in their numbers only (see `Kind`), each moved as
+        ``plant.of(robot)`` would move it. None: all are the plant's.
     threads : int
         Of the machine to work in; robots are shared out among them.
 
@@ -85,14 +86,15 @@ def rollout(
         The rods of a robot could not follow; the exception carries which ``robot``, at which ``step``, and its
         ``state`` at the start of that.
     ValueError
-        A plant that has no such graph, or an argument that is not finite or of the wrong shape.
+        A plant that has no such graph, a robot of another kind, or an argument that is not finite or of the wrong
+        shape.
     """
     if plant.step_model is None:
         raise ValueError(f"method {plant.method!r} with inertia {plant.inertia!r} has no rollout; use Plant.step")
     threads = checked_integer("threads", threads)
-    starts, inputs, f_ext, many = _checked(plant, x0, inputs, f_ext, robots)
+    starts, inputs, f_ext, many = checked_motion(plant, x0, inputs, f_ext, robots)
     count, steps = inputs.shape[:2]
-    plants = [plant] * count if robots is None else [plant.of(robot) for robot in robots]
+    plants = [plant] * count if robots is None else [_alike(plant, i, robot) for i, robot in enumerate(robots)]
     x, residual = np.empty((count, steps + 1, plant.n_states)), np.empty((count, steps))
     memories = _memories(plants, starts, guess)
     numbers = np.stack([one.numbers for one in plants])  # after the resets, which take a payload away
@@ -114,8 +116,8 @@ def rollout(
     return Rollout(t, x if many else x[0], residual if many else residual[0], tuple(stepped))
 
 
-def _checked(
-    plant: Plant, x0: Any, inputs: Any, f_ext: Any, different: Sequence[Robot] | None
+def checked_motion(
+    plant: Plant, x0: Any, inputs: Any, f_ext: Any, different: Sequence[Robot] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
     """Arguments with all their axes, and whether there is one of robots."""
     x0, inputs, f_ext = np.asarray(x0), np.asarray(inputs), np.asarray(f_ext)
@@ -137,13 +139,32 @@ def _checked(
     )
 
 
+def _alike(plant: Plant, index: int, robot: Robot) -> Plant:
+    """Plant of another robot of the same kind."""
+    if not isinstance(robot, Robot):
+        raise TypeError(f"robots[{index}] is a {type(robot).__name__}, expected a Robot")
+    other = plant.of(robot)
+    if other.step_model != plant.step_model:
+        raise ValueError(
+            f"robots[{index}] ({robot.name}) is of another kind than {plant.robot.name}: {_described(other)}, expected "
+            f"{_described(plant)}; name a method and a weight that do for both, or give it a rollout of its own"
+        )
+    return other
+
+
+def _described(plant: Plant) -> str:
+    layout = plant.step_model and plant.step_model.kind.layout
+    return f"{plant.robot.n_rods} rods, method {plant.method!r}, layout {layout}, weight {plant.weight!r}"
+
+
 def _memories(plants: list[Plant], starts: np.ndarray, guess: Equilibrium | None) -> np.ndarray:
     """What the graphs start from; robots that are and start alike share it."""
     found: dict[tuple[Plant, bytes], np.ndarray] = {}
-    for plant, x in zip(plants, starts, strict=True):
+    for i, (plant, x) in enumerate(zip(plants, starts, strict=True)):
         if (plant, x.tobytes()) not in found:
-            plant.reset(x, guess)
-            found[plant, x.tobytes()] = plant.memory(x)
+            with said_of(plant, i, 0, x):
+                plant.reset(x, guess)
+                found[plant, x.tobytes()] = plant.memory(x)
     return np.stack([found[plant, x.tobytes()] for plant, x in zip(plants, starts, strict=True)])
 
 
@@ -200,14 +221,21 @@ def _stepped(
     """States and residuals of one robot by `Plant.step`."""
     x, residual = np.empty((len(inputs) + 1, len(start))), np.empty(len(inputs))
     x[0] = start
-    step = 0
-    try:
+    with said_of(plant, robot, 0, start):
         plant.reset(start, guess)
-        for step in range(len(inputs)):
+    for step in range(len(inputs)):
+        with said_of(plant, robot, step, x[step]):
             x[step + 1] = plant.step(x[step], inputs[step], f_ext[step])
-            residual[step] = plant.residual
-    except PCRError as error:
-        error.details |= {"robot": robot, "step": step}
-        error.add_note(f"robot {robot}, step {step}, t = {step * plant.dt:.6g} s of a rollout")
-        raise
+        residual[step] = plant.residual
     return x, residual
+
+
+@contextmanager
+def said_of(plant: Plant, robot: int, step: int, x: np.ndarray) -> Iterator[None]:
+    """Errors say which robot it was, and when."""
+    try:
+        yield
+    except PCRError as error:
+        error.details |= {"robot": robot, "step": step, "state": x.copy()}
+        error.add_note(f"robot {robot} ({plant.robot.name}), step {step}, t = {step * plant.dt:.6g} s of a rollout")
+        raise

@@ -23,6 +23,8 @@ from .weight import robot_weight
 
 # Newton iterations for a force, to be tried in this order.
 CORRECTIONS = (1, 2)
+# Poses that a step of each integrator moves the rods to.
+SOLVES = {"semi_implicit_euler": 1, "velocity_verlet": 1, "rk4": 4}
 # A simulation uses the derivatives only to predict the next pose.
 PREDICTOR_ACCURACY = 1e-2
 # Relative drift of a rod's invariant beyond which its force may be off by per cents.
@@ -67,66 +69,99 @@ class StepModel:
         return np.concatenate([start, force, *(matrix.ravel(order="F") for matrix in kept)])
 
 
-class _Motion:
-    """Rods and mass on their way through a step, as expressions."""
+class Motion:
+    """Rods and mass on their way through a step, as expressions; a subclass says how the rods follow.
 
-    def __init__(self, model: StepModel, vector: Any, memory: Any, rates: Any, f_ext: Any, corrections: int) -> None:
+    Parameters
+    ----------
+    model : StepModel
+    vector : casadi
+        Numbers of the robot.
+    told, q, f_ext : casadi
+        What the motors are told, their angles at the start of the step, and the force on the tip besides its weight.
+    """
+
+    def __init__(self, model: StepModel, vector: Any, told: Any, q: Any, f_ext: Any) -> None:
         self.model, self.n = model, model.kind.n_rods
-        self._vector, self.numbers = vector, model.kind.unpack(vector)
-        self._of_rods = vector if model.weight == "exact" else model.kind.weightless(vector)
+        self.vector, self.numbers = vector, model.kind.unpack(vector)
+        self.of_rods = vector if model.weight == "exact" else model.kind.weightless(vector)
         self._push = f_ext + self.numbers.tip_mass * self.numbers.gravity
-        self._rates, self._corrections = rates, corrections
-        start, force, mass = model.widths
+        # As Robot.motor_rates.
+        lower, upper, limit = self.numbers.angle_lower, self.numbers.angle_upper, self.numbers.rate_limit
+        rates = ca.fmin(ca.fmax(told, -limit), limit)
+        rates = (ca.fmin(ca.fmax(q + model.dt * rates, lower), upper) - q) / model.dt
+        self._rates = ca.fmin(ca.fmax(rates, -limit), limit)
+        self.force: Any = None
+        size, tip = 2 + self.n, self.numbers.tip_mass
+        self.mass: tuple[Any, Any] = ca.diag(ca.vertcat(tip, tip, np.zeros(self.n))), ca.DM.zeros(size**2, size)
+
+    def known(self) -> list[Any]:
+        """First arguments of the graphs of `integrators`."""
+        return [*self.mass, self._push - self.force, self._rates, ca.vertcat(self.numbers.drag, self.model.dt)]
+
+    def follow(self, p: Any, q: Any) -> tuple[Any, Any]:
+        """Let the rods follow to (p, q), and return their unknowns (u, n) and the force that holds the tip."""
+        raise NotImplementedError
+
+    def move(self, p: Any, q: Any) -> None:
+        """Let all follow to (p, q)."""
+        model = self.model
+        unknowns, self.force = self.follow(p, q)
+        if model.weight == "condensed":
+            self.force += robot_weight(model.kind)[0](unknowns, q, self.vector)[1][:2]
+        if model.inertia == "condensed":
+            self.mass = tuple(robot_mass(model.kind, model.method)(unknowns, q, self.of_rods))
+
+    def advance(self, x: Any) -> Any:
+        """State at the end of a step from x, where all is."""
+        return _INTEGRATORS[self.model.integrator](self, x)
+
+
+class _WarmMotion(Motion):
+    """Rods that start from a memory, in a fixed number of Newton iterations."""
+
+    def __init__(self, memory: Any, corrections: int, *args: Any) -> None:
+        super().__init__(*args)
+        self._corrections = corrections
+        start, force, mass = self.model.widths
         self.start, self.force, mass = ca.vertsplit(memory, [0, start, start + force, start + force + mass])
         size = 2 + self.n
-        self._mass: tuple[Any, Any]
-        if model.inertia == "none":
-            tip = self.numbers.tip_mass
-            self._mass = ca.diag(ca.vertcat(tip, tip, np.zeros(self.n))), ca.DM.zeros(size**2, size)
-        elif model.inertia == "constant":
-            self._mass = ca.reshape(mass, size, size), ca.DM.zeros(size**2, size)
-        else:
-            self._mass = ca.reshape(mass[: size**2], size, size), ca.reshape(mass[size**2 :], size**2, size)
+        if self.model.inertia == "constant":
+            self.mass = ca.reshape(mass, size, size), ca.DM.zeros(size**2, size)
+        elif self.model.inertia == "condensed":
+            self.mass = ca.reshape(mass[: size**2], size, size), ca.reshape(mass[size**2 :], size**2, size)
         self.verdict: Any = 0
         self.record: Any = None
         self.result: Any = None
 
-    def known(self) -> list[Any]:
-        """First arguments of the graphs of `integrators`."""
-        return [*self._mass, self._push - self.force, self._rates, ca.vertcat(self.numbers.drag, self.model.dt)]
-
-    def move(self, p: Any, q: Any) -> None:
-        """Let the rods follow to (p, q)."""
+    def follow(self, p: Any, q: Any) -> tuple[Any, Any]:
         model = self.model
         warm = warm_step(model.kind, model.method, self._corrections)
-        self.record, verdict, self.result = warm(ca.vertcat(p, q), self.start, self._of_rods)
+        self.record, verdict, self.result = warm(ca.vertcat(p, q), self.start, self.of_rods)
         self.verdict += verdict
-        self.start, self.force = self.record[: model.widths[0]], self.result[:2]
+        self.start = self.record[: model.widths[0]]
         unknowns = ca.reshape(self.record[: model.method.newton.size1_in(0) * self.n], -1, self.n)
-        if model.weight == "condensed":
-            self.force += robot_weight(model.kind)[0](unknowns, q, self._vector)[1][:2]
-        if model.inertia == "condensed":
-            self._mass = tuple(robot_mass(model.kind, model.method)(unknowns, q, self._of_rods))
+        return unknowns, self.result[:2]
 
     def memory(self) -> Any:
         """What the next step starts from."""
-        kept = {"none": (), "constant": self._mass[:1], "condensed": self._mass}[self.model.inertia]
+        kept = {"none": (), "constant": self.mass[:1], "condensed": self.mass}[self.model.inertia]
         return ca.vertcat(self.start, self.force, *(ca.vec(matrix) for matrix in kept))
 
 
-def _semi_implicit_euler(motion: _Motion, x: Any) -> Any:
+def _semi_implicit_euler(motion: Motion, x: Any) -> Any:
     p, q, momentum = euler_graph(motion.n)(*motion.known(), x)
     motion.move(p, q)
     return ca.vertcat(p, stop_graph(motion.n)(*motion.known(), momentum), q)
 
 
-def _velocity_verlet(motion: _Motion, x: Any) -> Any:
+def _velocity_verlet(motion: Motion, x: Any) -> Any:
     p, q, momentum = first_half_graph(motion.n)(*motion.known(), x)
     motion.move(p, q)
     return ca.vertcat(p, second_half_graph(motion.n)(*motion.known(), momentum), q)
 
 
-def _rk4(motion: _Motion, x: Any) -> Any:
+def _rk4(motion: Motion, x: Any) -> Any:
     mass = motion.known()[0]
     y = start = total = ca.vertcat(x[:2], mass[:2, :2] @ x[2:4], x[4:])
     for i, (ahead, weight) in enumerate(RK4_STAGES):
@@ -161,21 +196,15 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
         at the end of the step (see `warm_step`). A memory is of the pose of its x. u is what the motors are told, f_ext
         comes on top of the tip's weight. The verdict is that of `warm_step`, added up over the solves of the step.
     """
-    n, dt = model.kind.n_rods, model.dt
+    n = model.kind.n_rods
     graphs = [warm_step(model.kind, model.method, corrections)]
     if model.inertia == "condensed":
         graphs.append(robot_mass(model.kind, model.method))
     symbol: Any = (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym
     memory, x, given = symbol("memory", sum(model.widths)), symbol("x", 4 + n), symbol("given", n + 2)
     vector = symbol("numbers", model.kind.size)
-    u, f_ext, numbers = given[:n], given[n:], model.kind.unpack(vector)
-    # As Robot.motor_rates.
-    lower, upper, limit, q = numbers.angle_lower, numbers.angle_upper, numbers.rate_limit, x[4:]
-    rates = ca.fmin(ca.fmax(u, -limit), limit)
-    rates = (ca.fmin(ca.fmax(q + dt * rates, lower), upper) - q) / dt
-    rates = ca.fmin(ca.fmax(rates, -limit), limit)
-    motion = _Motion(model, vector, memory, rates, f_ext, corrections)
-    end = _INTEGRATORS[model.integrator](motion, x)
+    motion = _WarmMotion(memory, corrections, model, vector, given[:n], x[4:], given[n:])
+    end = motion.advance(x)
     results = [motion.memory(), end, motion.verdict]
     if details:
         results += [motion.record, motion.result]
