@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pcr_mpc.loop.along_plan import AlongPlan
 
 from pcr_mpc import Plant, inverse_statics, linearise, load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.control.laws import LQR, PD, FeedForward
 from pcr_mpc.control.qp import Reference
 from pcr_mpc.control.tuning import Limits
-from pcr_mpc.loop.along_plan import AlongPlan
 
 from .conftest import CONTROLLERS, MODELS
 

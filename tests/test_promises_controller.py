@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pcr_mpc.loop.along_plan import AlongPlan
 
 from pcr_mpc import (
     ConvergenceError,
@@ -17,7 +18,6 @@ from pcr_mpc import (
     simulate,
     solve_statics,
 )
-from pcr_mpc.loop.along_plan import AlongPlan
 from pcr_mpc.loop.controllers import HoldMotors
 from pcr_mpc.loop.feed_forward import feed_forward
 from pcr_mpc.loop.settings import Payload

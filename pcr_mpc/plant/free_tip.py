@@ -118,7 +118,7 @@ def inverse_statics(
         if mode is not None:
             raise ValueError("give either guess, whose branch is followed, or mode, for a search")
         _require_equilibrium(guess)
-        solver.start(guess.p, guess.q, guess.nodes)
+        solver.begin(guess)
         eq = solver.equilibrium(p, _reach(solver, guess, p, force))
         _require_usable(eq)
         return eq
@@ -212,7 +212,7 @@ def _follow(solver: RodSolver, guess: Equilibrium, q: np.ndarray, force: np.ndar
     while done < 1.0:
         target = 1.0 if done + substep >= 1.0 else done + substep
         at_q, at_force = guess.q + target * (q - guess.q), guess.force + target * (force - guess.force)
-        solver.start(eq.p, eq.q, eq.nodes)
+        solver.begin(eq)
         try:
             predicted = eq.p + np.linalg.solve(eq.dforce_dp, at_force - eq.force - eq.dforce_dq @ (at_q - eq.q))
             robot.require_reachable(predicted)

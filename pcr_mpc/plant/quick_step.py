@@ -8,7 +8,8 @@ from operator import le
 import numpy as np
 
 from ..buffered import BufferedFunction
-from .rod_solver import ROUGH, RodSolver
+from .first_rung import ROUGH
+from .rod_solver import RodSolver
 from .step_graph import CORRECTIONS, StepModel, limits, step_function
 
 _SOLVES = {"semi_implicit_euler": 1, "velocity_verlet": 1, "rk4": 4}
