@@ -32,16 +32,19 @@ if TYPE_CHECKING:
     from .loop.simulate import simulate
     from .loop.tracking import TrackingController, make_controller
     from .plant.dynamics import Plant
+    from .plant.equilibria import Equilibria
     from .plant.equilibrium import Equilibrium
     from .plant.free_tip import forward_statics, inverse_statics
     from .plant.robot import Robot, Rod, load_robot
     from .plant.rollout import Rollout, rollout
     from .plant.stability import Stability, all_equilibria, assess_stability, distance_to_fold
     from .plant.statics import solve_statics
+    from .plant.statics_batch import solve_statics_batch
 
 __all__ = [
     "CompilerError",
     "ConvergenceError",
+    "Equilibria",
     "Equilibrium",
     "HoldMotors",
     "InfeasibleError",
@@ -82,6 +85,7 @@ __all__ = [
     "rollout",
     "simulate",
     "solve_statics",
+    "solve_statics_batch",
 ]
 
 _WHERE = {
@@ -109,12 +113,14 @@ _WHERE = {
     "loop.simulate": ("simulate",),
     "loop.tracking": ("TrackingController", "make_controller"),
     "plant.dynamics": ("Plant",),
+    "plant.equilibria": ("Equilibria",),
     "plant.equilibrium": ("Equilibrium",),
     "plant.free_tip": ("forward_statics", "inverse_statics"),
     "plant.robot": ("Robot", "Rod", "load_robot"),
     "plant.rollout": ("Rollout", "rollout"),
     "plant.stability": ("Stability", "all_equilibria", "assess_stability", "distance_to_fold"),
     "plant.statics": ("solve_statics",),
+    "plant.statics_batch": ("solve_statics_batch",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 

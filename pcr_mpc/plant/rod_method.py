@@ -106,10 +106,15 @@ class RodMethod:
     layout: Layout | None = None
 
 
+def _by_segment(unknowns: np.ndarray, _angle: float, _count: int) -> np.ndarray:
+    return unknowns.reshape((4, -1), order="F").copy()
+
+
 # By the name of a method, for those who have unknowns and no graphs.
 TO_NODES: dict[str, Callable[[np.ndarray, float, int], np.ndarray]] = {
     "closed_form": elastica.nodes,
-    "multiple_shooting": lambda unknowns, _angle, _n: unknowns.reshape((4, -1), order="F").copy(),
+    "multiple_shooting": _by_segment,
+    "single_shooting": _by_segment,
 }
 
 
