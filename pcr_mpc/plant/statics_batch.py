@@ -18,12 +18,13 @@ from .numbers import Kind
 from .robot import Robot
 from .rod_follower import BRANCH_CHANGE
 from .rod_method import RodMethod, warm_step
+from .rod_physics import robot_layout
 from .rod_solver import RodSolver
 from .rod_state import columns
 from .statics import Way, chosen_way, solver_of
 
 # Poses in one call of a graph: each size is built once.
-_SIZES = (512, 64, 8, 1)
+_SIZES, _GROWTH = (512, 64, 8, 1), 8
 # Angle and slack beyond which the checks for one pose are asked, with their rounding and their words.
 _LARGE, _DOUBTFUL = 1e5, 1e-6
 
@@ -118,6 +119,8 @@ class _Work:
         self.unstable = np.zeros((count, n), dtype=bool)
         self.reasons = [""] * count
         self._wanted = np.full(count, np.inf)  # drift
+        self._kind = Kind(n, robot_layout(robot))
+        self._numbers = self._kind.pack(robot)
 
     def result(self) -> Equilibria:
         """All rows."""
@@ -158,7 +161,7 @@ class _Work:
 
     def by_graphs(self, solver: RodSolver, guess: Equilibrium | None, *, along: bool) -> None:
         """Solve blocks of rows in one call each, and alone those that a few Newton iterations do not bring along."""
-        slack = [1 - np.hypot(*(self.p - rod.base).T) / rod.length for rod in self.robot.rods]
+        slack = [1 - np.linalg.norm(self.p - rod.base, axis=1) / rod.length for rod in self.robot.rods]
         # Written so that NaN is not fit.
         fit = (np.abs(self.q).max(axis=1) < _LARGE) & (np.min(slack, axis=0) > _DOUBTFUL)
         if self.way.refined:
@@ -191,12 +194,12 @@ class _Work:
             # Up to the next that is not fit, in as large a block as there is.
             block = fit[row : row + size]
             size = next(size for size in _SIZES if size <= (len(block) if block.all() else int(block.argmin())))
-            rows = np.arange(row, row + size)
+            rows = slice(row, row + size)
             records, verdict, results = self._called(method, rows, _record(last), along=True)
             good = self._good(method, rows, verdict, verdict[:, 2])
             done = size if good.all() else int(good.argmin())
             if done:
-                self._take(rows[:done], records[:done], verdict[:done], results[:done])
+                self._take(slice(row, row + done), records[:done], verdict[:done], results[:done])
                 i, pose = done - 1, np.concatenate((self.p[row + done - 1], self.q[row + done - 1]))
                 residual, drift = float(verdict[i, 0]), float(verdict[i, 4])
                 found = Climbed(records[i], results[i], residual, drift, method.settling)
@@ -206,14 +209,14 @@ class _Work:
                 last = self.alone(row, last) or last
                 row += 1
             # Small blocks after a row that failed, where others may: what is behind it was for nothing.
-            size = _SIZES[0] if done == size else _SIZES[-1]
+            size = min(_GROWTH * size, _SIZES[0]) if done == size else _SIZES[-1]
 
     def _spread(self, method: RodMethod, guess: Equilibrium, rows: np.ndarray) -> None:
         """Solve rows from one equilibrium; a second time from where the first led, if that was on its branch."""
         starts = np.broadcast_to(_record(guess), (len(rows), len(_record(guess))))
         changed = np.zeros(len(rows))
         for _ in range(2):
-            reached, again, first = np.empty_like(starts), np.zeros(len(rows), dtype=bool), 0
+            again, reached, first = np.zeros(len(rows), dtype=bool), [], 0
             while first < len(rows):
                 size = next(size for size in _SIZES if size <= len(rows) - first)
                 some = slice(first, first + size)
@@ -222,33 +225,35 @@ class _Work:
                 good = self._good(method, rows[some], verdict, changed[some])
                 self._take(rows[some][good], records[good], verdict[good], results[good])
                 near = (changed[some] <= BRANCH_CHANGE) & (verdict[:, 3] <= 0) & np.isfinite(verdict[:, 0])
-                reached[some], again[some] = records, near & ~good
+                again[some] = near & ~good
+                reached.append(records[again[some]])
                 first += size
-            rows, starts, changed = rows[again], reached[again], changed[again]
+            if not again.any():
+                return
+            rows, starts, changed = rows[again], np.concatenate(reached), changed[again]
 
-    def _good(self, method: RodMethod, rows: np.ndarray, verdict: np.ndarray, changed: np.ndarray) -> np.ndarray:
+    def _good(self, method: RodMethod, rows: Any, verdict: np.ndarray, changed: np.ndarray) -> np.ndarray:
         """Whether rods have followed to rounding, as `FirstRung` has it; NaN is not good."""
         solved = (verdict[:, :2] <= method.tolerance).all(axis=1) & (verdict[:, 4] <= self._wanted[rows])
         return np.asarray(solved & (changed <= BRANCH_CHANGE) & (verdict[:, 3] <= 0))
 
     def _called(
-        self, method: RodMethod, rows: np.ndarray, starts: np.ndarray, *, along: bool
+        self, method: RodMethod, rows: Any, starts: np.ndarray, *, along: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Records, verdicts and results of rows, valid until the next call; ``starts`` are whole records."""
+        """Records, verdicts and results of rows (a slice or indices), valid until the next call; starts are records."""
         interrupt.check()
-        n, count = self.robot.n_rods, len(rows)
-        kind = Kind(n, method.layout)
-        graph = _many(kind, method, count, along, self.compiled)
+        count = len(self.p[rows])
+        graph = _many(self._kind, method, count, along, self.compiled)
         start, target, numbers = (place.T.reshape(-1, place.shape[0]) for place in graph.inputs)
         start[:] = starts[..., : start.shape[1]]
-        target[:, :2], target[:, 2:], numbers[:] = self.p[rows], self.q[rows], kind.pack(self.robot)
+        target[:, :2], target[:, 2:], numbers[:] = self.p[rows], self.q[rows], self._numbers
         graph()
         records, verdict, results = (place.T.reshape(count, -1) for place in graph.outputs[-3:])
         return records, verdict, results
 
-    def _take(self, rows: np.ndarray, records: np.ndarray, verdict: np.ndarray, results: np.ndarray) -> None:
+    def _take(self, rows: Any, records: np.ndarray, verdict: np.ndarray, results: np.ndarray) -> None:
         """Copy what the graphs found."""
-        n, to, count = self.robot.n_rods, self.arrays, len(rows)
+        n, to, count = self.robot.n_rods, self.arrays, len(records)
         if not count:
             return
         force_units, moments = self.robot.stiffnesses / self.robot.lengths**2, moment_units(self.robot)
