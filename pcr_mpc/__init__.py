@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .loop.simulate import simulate
     from .loop.tracking import TrackingController, make_controller
     from .plant.dynamics import Plant
+    from .plant.equilibria import Equilibria
     from .plant.equilibrium import Equilibrium
     from .plant.free_tip import forward_statics, inverse_statics
     from .plant.robot import Robot, Rod, load_robot
@@ -39,10 +40,12 @@ if TYPE_CHECKING:
     from .plant.sensitivities import Sensitivities, sensitivities
     from .plant.stability import Stability, all_equilibria, assess_stability, distance_to_fold
     from .plant.statics import solve_statics
+    from .plant.statics_batch import solve_statics_batch
 
 __all__ = [
     "CompilerError",
     "ConvergenceError",
+    "Equilibria",
     "Equilibrium",
     "HoldMotors",
     "InfeasibleError",
@@ -85,6 +88,7 @@ __all__ = [
     "sensitivities",
     "simulate",
     "solve_statics",
+    "solve_statics_batch",
 ]
 
 _WHERE = {
@@ -112,6 +116,7 @@ _WHERE = {
     "loop.simulate": ("simulate",),
     "loop.tracking": ("TrackingController", "make_controller"),
     "plant.dynamics": ("Plant",),
+    "plant.equilibria": ("Equilibria",),
     "plant.equilibrium": ("Equilibrium",),
     "plant.free_tip": ("forward_statics", "inverse_statics"),
     "plant.robot": ("Robot", "Rod", "load_robot"),
@@ -119,6 +124,7 @@ _WHERE = {
     "plant.sensitivities": ("Sensitivities", "sensitivities"),
     "plant.stability": ("Stability", "all_equilibria", "assess_stability", "distance_to_fold"),
     "plant.statics": ("solve_statics",),
+    "plant.statics_batch": ("solve_statics_batch",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 

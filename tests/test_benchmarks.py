@@ -24,6 +24,16 @@ def test_worse_is_less_than_half_of_what_was_kept(old, new, worse):
     assert Change("ratio", old, new).worse is worse
 
 
+@pytest.mark.parametrize("name", benchmarks.PROMISED)
+def test_what_is_promised_counts_whatever_was_kept(name):
+    least = benchmarks.PROMISED[name]
+    for old in (None, 0.1 * least, least):
+        assert Change(name, old, 0.99 * least).worse
+        assert Change(name, old, None).worse
+        assert not Change(name, old, 1.01 * least).worse
+    assert Change(name, 3 * least, 1.01 * least).worse
+
+
 def test_changes_cover_what_is_new_and_what_is_gone():
     found = changes({"kept": 2.0, "gone": 3.0}, {"kept": 4.0, "added": 5.0})
     assert [(one.name, one.old, one.new) for one in found] == [
@@ -31,7 +41,7 @@ def test_changes_cover_what_is_new_and_what_is_gone():
         ("added", None, 5.0),
         ("gone", 3.0, None),
     ]
-    assert "WORSE" in show(found)
+    assert "TOO SMALL" in show(found)
     assert "| gone | 3 | - |" in show(found, markdown=True)
 
 

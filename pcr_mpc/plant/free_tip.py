@@ -21,6 +21,7 @@ _MAX_TRIALS = 30  # motor angles tried for one balance; of 1600 that were found,
 _FORCE_TOLERANCE = 1e-9  # of the robot's force scale, sum EI/L^2
 _RESOLUTION = 1e-12  # of the tip position, in rod lengths
 _ANGLE_STEP = 0.25  # largest motor step of a continuation [rad]
+_AHEAD = 0.1  # turn of the motors up to which the linear prediction of it is tried [rad]
 _SMALLEST_STEP = 1e-5  # of a continuation, as a fraction of the way
 _FOLD_STIFFNESS = 0.05  # smallest over largest eigenvalue of K: one that ends there has come to a fold
 _TIP_STEP = 0.05  # largest tip step of a continuation, in rod lengths
@@ -118,7 +119,7 @@ def inverse_statics(
         if mode is not None:
             raise ValueError("give either guess, whose branch is followed, or mode, for a search")
         _require_equilibrium(guess)
-        solver.start(guess.p, guess.q, guess.nodes)
+        solver.begin(guess)
         eq = solver.equilibrium(p, _reach(solver, guess, p, force))
         _require_usable(eq)
         return eq
@@ -212,7 +213,7 @@ def _follow(solver: RodSolver, guess: Equilibrium, q: np.ndarray, force: np.ndar
     while done < 1.0:
         target = 1.0 if done + substep >= 1.0 else done + substep
         at_q, at_force = guess.q + target * (q - guess.q), guess.force + target * (force - guess.force)
-        solver.start(eq.p, eq.q, eq.nodes)
+        solver.begin(eq)
         try:
             predicted = eq.p + np.linalg.solve(eq.dforce_dp, at_force - eq.force - eq.dforce_dq @ (at_q - eq.q))
             robot.require_reachable(predicted)
@@ -281,11 +282,15 @@ def _reach(solver: RodSolver, guess: Equilibrium, p: np.ndarray, force: np.ndarr
     """Follow the branch of ``guess`` to (p, force), in sub-steps where one step fails."""
     longest = _TIP_STEP * float(solver.robot.lengths.min())
     q, done = guess.q, 0.0
+    k, g = guess.dforce_dp, guess.dforce_dq
     largest = substep = min(1.0, longest / max(float(np.linalg.norm(p - guess.p)), longest))
     while done < 1.0:
         target = min(1.0, done + substep)
+        at_p, at_force = guess.p + target * (p - guess.p), guess.force + target * (force - guess.force)
+        moved = (target - done) * (p - guess.p)
+        ahead = _least_motion(g, (target - done) * (force - guess.force) - k @ moved)
         try:
-            q = _turn(solver, guess.p + target * (p - guess.p), q, guess.force + target * (force - guess.force))
+            q = _turn(solver, at_p, q, at_force, ahead)
         except ConvergenceError as error:
             substep /= 2
             if substep < 1e-2:
@@ -298,16 +303,34 @@ def _reach(solver: RodSolver, guess: Equilibrium, p: np.ndarray, force: np.ndarr
                 ) from None
         else:
             done, substep = target, min(2 * substep, largest)
+            k, g = solver.jacobians()
     return q
 
 
-def _turn(solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Turn the motors by Newton's method (least motion if redundant) until the rods carry ``force`` at p."""
+def _least_motion(g: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Turn of the motors by which the rods carry so much more force: the least, if they are redundant."""
+    return np.asarray(np.linalg.lstsq(g, force, rcond=1e-10)[0])
+
+
+def _turn(
+    solver: RodSolver, p: np.ndarray, q: np.ndarray, force: np.ndarray, ahead: np.ndarray | None = None
+) -> np.ndarray:
+    """Turn the motors by Newton's method (least motion if redundant) until the rods carry ``force`` at p.
+
+    ``ahead`` is by how much they are expected to turn, which saves an iteration if it is little.
+    """
     tolerance = _FORCE_TOLERANCE * solver.robot.force_scale
-    solver.move(p, q)
+    if ahead is not None and np.abs(ahead).max() < _AHEAD:
+        try:
+            solver.move(p, q + ahead)
+            q = q + ahead
+        except PCRError:
+            solver.move(p, q)
+    else:
+        solver.move(p, q)
     residual, trials = force - solver.force(), 0
     while math.hypot(*residual) > tolerance:
-        step = np.linalg.lstsq(solver.jacobians()[1], residual, rcond=1e-10)[0]
+        step = _least_motion(solver.jacobians()[1], residual)
         step *= _ANGLE_STEP / max(float(np.abs(step).max()), _ANGLE_STEP)
         while True:
             if trials == _MAX_TRIALS:

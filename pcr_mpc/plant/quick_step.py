@@ -8,7 +8,8 @@ from operator import le
 import numpy as np
 
 from ..buffered import BufferedFunction
-from .rod_solver import ROUGH, RodSolver
+from .first_rung import ROUGH
+from .rod_solver import RodSolver
 from .step_graph import CORRECTIONS, SOLVES, StepModel, limits, step_function
 
 

@@ -156,7 +156,7 @@ class Robot(Frozen):
         """Number of rods, equal to the number of motors."""
         return len(self.rods)
 
-    @property
+    @cached_property
     def needs_shooting(self) -> str | None:
         """Why the closed form does not hold for these rods, or None where it does: then it is exact."""
         reasons = {
@@ -209,7 +209,7 @@ class Robot(Frozen):
     def checked_angles(self, name: str, value: Any) -> np.ndarray:
         """Return motor angles as a float64 vector, shape (n,) [rad], or say what is wrong with them."""
         q = checked_vector(name, value, self.n_rods)
-        if np.abs(q).max() > _LARGEST_ANGLE:
+        if max(map(abs, q.tolist())) > _LARGEST_ANGLE:
             raise ValueError(f"{name} is {q} rad, expected at most {_LARGEST_ANGLE:g} rad; take off the whole turns")
         return q
 

@@ -73,6 +73,8 @@ class RodMethod:
         (unknowns, pose, tangent) -> change: a cheap iteration with derivatives that are there, if there is one.
     tolerance : float
         Residual at which a rod counts as solved: rounding.
+    settling : int
+        Newton iterations that bring a rod to the tolerance from nearby, derivatives included.
     following : float
         Residual that will do from one time step of a simulation to the next.
     from_shape : callable
@@ -95,12 +97,25 @@ class RodMethod:
     any_pull: RodGraphs
     chord: Any
     tolerance: float
+    settling: int
     following: float
     from_shape: Callable[[HeldShape, float], np.ndarray]
     from_nodes: Callable[[np.ndarray, RodPhysics | None], list[np.ndarray]]
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
     mass: Callable[[], Any]
     layout: Layout | None = None
+
+
+def _by_segment(unknowns: np.ndarray, _angle: float, _count: int) -> np.ndarray:
+    return unknowns.reshape((4, -1), order="F").copy()
+
+
+# By the name of a method, for those who have unknowns and no graphs.
+TO_NODES: dict[str, Callable[[np.ndarray, float, int], np.ndarray]] = {
+    "closed_form": elastica.nodes,
+    "multiple_shooting": _by_segment,
+    "single_shooting": _by_segment,
+}
 
 
 @graph_cache()
@@ -127,10 +142,11 @@ def shooting_method(shooting: Shooting, layout: Layout | None) -> RodMethod:
         chord=None,
         # Relative to the load; on taut rods the equations have a condition of 1e8.
         tolerance=1e-10,
+        settling=2,
         following=1e-10,
         from_shape=lambda shape, angle: shape.nodes(n, angle).ravel(order="F"),
         from_nodes=from_nodes,
-        to_nodes=lambda unknowns, _angle, _n: unknowns.reshape((4, n), order="F").copy(),
+        to_nodes=TO_NODES["multiple_shooting"],
         mass=lambda: shooting_inertia.rod_mass(n, steps, shooting.scheme, layout),
         layout=layout,
     )
@@ -151,10 +167,11 @@ def closed_form_method() -> RodMethod:
         ),
         chord=elastica.rod_chord(),
         tolerance=1e-13,
+        settling=3,
         following=1e-11,
         from_shape=lambda shape, _: np.array([shape.log_tip_angle, shape.load, shape.hand]),
         from_nodes=lambda nodes, _: [elastica.from_nodes(nodes), elastica.from_base(nodes)],
-        to_nodes=elastica.nodes,
+        to_nodes=TO_NODES["closed_form"],
         mass=inertia.rod_mass,
     )
 

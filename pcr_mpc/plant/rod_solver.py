@@ -8,19 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..buffered import BufferedFunction
 from ..errors import ConvergenceError, PCRError, UnstableError
-from .equilibrium import Equilibrium
-from .numbers import Kind
+from .equilibrium import Equilibrium, moment_units
+from .first_rung import FirstRung
 from .robot import Robot
 from .robot_state import RobotState
-from .rod_follower import BRANCH_CHANGE, BranchEnds, NotConverged, RodFollower
-from .rod_method import RodMethod, enough_nodes, warm_step
+from .rod_follower import BranchEnds, NotConverged, RodFollower
+from .rod_method import RodMethod
 from .rod_physics import in_layout, require_plain
 from .rod_state import RodState
 
-# Residual beyond which another iteration is not worth trying.
-ROUGH = 1e-4
 _MOST_SNAPS = 4  # of one rod in one move
 
 
@@ -59,6 +56,7 @@ class RodSolver:
 
     Attributes
     ----------
+    first : FirstRung
     rungs : Counter
         How many poses each rung of the ladder has solved.
     snaps : list of Snap
@@ -86,14 +84,10 @@ class RodSolver:
         # Plain rods share one follower.
         physics = (None,) if method.layout is None else in_layout(robot, method.layout)
         self._followers = [RodFollower(method, of_rod) for of_rod in physics] * (robot.n_rods // len(physics))
-        kind = Kind(robot.n_rods, method.layout)
-        self._warm = [BufferedFunction(warm_step(kind, method, iterations)) for iterations in (1, 2)]
-        for warm in self._warm:
-            warm.inputs[2][:] = kind.pack(robot)
+        self.first = FirstRung(robot, method)
         self._state: RobotState | None = None
         self._spare: RobotState | None = None
-        self._force_units = robot.stiffnesses / robot.lengths**2
-        self._moment_units = robot.stiffnesses / robot.lengths
+        self._moment_units = moment_units(robot)
 
     def start(self, p: np.ndarray, q: np.ndarray, nodes: np.ndarray | None = None) -> None:
         """Solve at (p, q) from a guess of the nodes, shape (n, 4, any N), or cold (None).
@@ -109,8 +103,20 @@ class RodSolver:
                 rods.append(rod.cold(pose) if nodes is None else rod.from_nodes(pose, nodes[i]))
             except NotConverged as failure:
                 raise self._error(i, failure, p, q) from None
-        self._state, self._spare = RobotState(self.robot, rods), RobotState(self.robot, rods)
+        self._state, self._spare = RobotState.of_rods(self.robot, rods), RobotState.of_rods(self.robot, rods)
         self.rungs[self._state.rung] += 1
+        self.snaps.clear()
+
+    def begin(self, guess: Equilibrium) -> None:
+        """Start where an equilibrium is: from its record if that is of this robot and method, else from its nodes."""
+        if guess.robot != self.robot or not self.first.knows(guess):
+            self.start(guess.p, guess.q, guess.nodes)
+            return
+        assert guess.record is not None
+        if self._state is None:
+            self._state, self._spare = (RobotState(self.robot, guess.record) for _ in range(2))
+        else:
+            self.recall(guess.record)
         self.snaps.clear()
 
     def move(
@@ -136,7 +142,10 @@ class RodSolver:
         """
         state = self.state
         self._snaps_before = len(self.snaps)
-        if self._move_warm(state, p, q, derivatives):
+        found = self.first.climb(state.start, p, q, derivatives)
+        if found is not None:
+            record, result, residual, drift, iterations = found
+            self.adopt(record, result, drift=drift, residual=residual, iterations=iterations)
             self.rungs["warm"] += 1
             return
         rods = state.rods()
@@ -146,31 +155,9 @@ class RodSolver:
                 rods[i] = self._follow(i, rods[i], pose, derivatives, continuation, snaps)
             except NotConverged as failure:
                 raise self._error(i, failure, p, q) from None
-        self._state, self._spare = RobotState(self.robot, rods), state
+        self._state, self._spare = RobotState.of_rods(self.robot, rods), state
         self.rungs[self._state.rung] += 1
         self.snaps += snaps
-
-    def _move_warm(self, state: RobotState, p: np.ndarray, q: np.ndarray, derivatives: float | None) -> bool:
-        """Climb the first rung; a second time from where the first led if that was close but not enough."""
-        # Where rough derivatives will do, one Newton iteration usually does.
-        rough = derivatives is not None and derivatives >= ROUGH
-        solved = self.method.tolerance if derivatives is None else self.method.following
-        source, changed, iterations = state.start, 0.0, 0
-        for warm in (self._warm[0 if rough else 1], self._warm[0]):
-            target, start, _ = warm.inputs
-            target[:2], target[2:], start[:] = p, q, source
-            warm()
-            residual, at_derivatives, change, conjugate_points, drift = warm.outputs[1].tolist()
-            changed += change
-            iterations += 1 if warm is self._warm[0] else 2
-            # Written so that NaN is a failure.
-            if not (residual <= ROUGH and changed <= BRANCH_CHANGE and not conjugate_points):
-                return False
-            if residual <= solved and at_derivatives <= (solved if derivatives is None else derivatives):
-                self.adopt(warm.outputs[0], warm.outputs[2], drift=drift, residual=residual, iterations=iterations)
-                return True
-            source = warm.outputs[0][: len(source)]
-        return False
 
     def _follow(
         self,
@@ -240,30 +227,17 @@ class RodSolver:
     def equilibrium(self, p: np.ndarray, q: np.ndarray) -> Equilibrium:
         """Everything about the last pose, which was solved at (p, q)."""
         state = self.state
-        k, g = self.jacobians()
-        n_nodes = enough_nodes(state.loads, 8)
-        nodes = [
-            self.method.to_nodes(u, pose[2], n_nodes) for u, pose in zip(state.unknowns.T, state.poses.T, strict=True)
-        ]
-        return Equilibrium(
-            robot=self.robot,
-            p=np.array(p),
-            q=np.array(q),
-            method=self.method.name,
-            force=self.force().copy(),
-            dforce_dp=k.copy(),
-            dforce_dq=g.copy(),
-            # The motor turns the rod's base against its internal moment.
-            motor_torque=-self._moment_units * state.loads[2],
-            dtorque_dq=-self._moment_units * state.load_tangents[2, 2::3],
-            energy=self.energy(),
-            rod_forces=(state.loads[:2] * self._force_units).T,
-            nodes=np.stack(nodes),
+        return Equilibrium.of_record(
+            self.robot,
+            np.concatenate([p, q]),
+            self.method.name,
+            state.record.copy(),
+            state.result.copy(),
             residual_norm=float(state.residual),
             iterations=state.iterations,
             rung=state.rung,
-            drift=self.drift(),
-            unstable_rods=self.unstable_rods(),
+            drift=state.drift,
+            unstable_rods=state.unstable_rods,
         )
 
     @property

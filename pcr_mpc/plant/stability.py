@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,10 +88,11 @@ def least_rod_margin(eq: Equilibrium) -> float:
     if eq.robot.needs_shooting is not None:
         return float("nan")
     margins = []
-    for nodes in eq.nodes:
-        bound = 1.0 - float(np.sqrt(np.hypot(*nodes[1:3, 0]))) / LEAST_CRITICAL_LOAD
+    for i, (force, rod) in enumerate(zip(eq.rod_forces.tolist(), eq.robot.rods, strict=True)):
+        load = rod.length * math.sqrt(math.hypot(*force) / rod.bending_stiffness)
+        bound = 1.0 - load / LEAST_CRITICAL_LOAD
         if bound < _NEAR:
-            log_tip_angle, load, _ = elastica.from_nodes(nodes)
+            log_tip_angle, load, _ = elastica.from_nodes(eq.nodes[i])
             bound = 1.0 - load / critical_load(log_tip_angle)
         margins.append(bound)
     return min(margins)
@@ -150,7 +152,7 @@ def distance_to_fold(eq: Equilibrium, p_end: Any, q_end: Any, tolerance: float =
     if not eq.stable:
         return 0.0
     solver = free_solver(eq.robot)
-    solver.start(eq.p, eq.q, eq.nodes)
+    solver.begin(eq)
     done, step = 0.0, 1.0 / 32.0
     while done < 1.0 and step > tolerance:
         target = min(1.0, done + step)
@@ -246,7 +248,7 @@ def _balance(solver: RodSolver, start: Equilibrium, force: np.ndarray) -> Equili
     robot, p, q = start.robot, start.p, start.q
     longest = 0.1 * robot.lengths.min()
     try:
-        solver.start(p, q, start.nodes)
+        solver.begin(start)
         for _ in range(_MAX_ITERATIONS):
             residual = solver.force() - force
             if np.linalg.norm(residual) < _BALANCED * robot.force_scale:
@@ -264,7 +266,7 @@ def _balance(solver: RodSolver, start: Equilibrium, force: np.ndarray) -> Equili
 def _descend(solver: RodSolver, start: Equilibrium, force: np.ndarray) -> Equilibrium | None:
     """Energy descent to a stable pose; None if the rods cannot follow."""
     try:
-        solver.start(start.p, start.q, start.nodes)
+        solver.begin(start)
         return solver.equilibrium(settle(solver, start.p, start.q, force), start.q)
     except PCRError:
         return None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -63,6 +65,7 @@ def solve_statics(
     guess : Equilibrium or ndarray, optional
         An equilibrium of this robot, whose branch is followed to (p, q); or nodes of shape (n, 4, N) from
         which to iterate (see `Equilibrium.nodes`). None: each rod takes its stable shape of least energy.
+        One of the same method that is near costs little more than its graph.
 
     Returns
     -------
@@ -85,54 +88,91 @@ def solve_statics(
     """
     p, q = checked_vector("p", p, 2), robot.checked_angles("q", q)
     robot.require_reachable(p)
-    method = method or default_method(robot)
-    shooting = checked_shooting(segments, 1 if steps is None else steps, scheme)
-    if steps is None and method in _WANTED_DRIFT:
-        return _refined(robot, p, q, method, segments, guess)
-    solver = _solver(robot, method, shooting)
-    if isinstance(guess, Equilibrium):
-        solver.start(guess.p, guess.q, _of(robot, guess).nodes)
-        solver.move(p, q)
-    else:
-        solver.start(p, q, None if guess is None else _checked_nodes(guess, robot))
-    return solver.equilibrium(p, q)
+    return chosen_way(robot, method, segments, steps, scheme).solve(robot, p, q, guess)
 
 
-def _refined(
-    robot: Robot,
-    p: np.ndarray,
-    q: np.ndarray,
-    method: str,
-    segments: int,
-    guess: Equilibrium | np.ndarray | None,
-) -> Equilibrium:
-    """Solve with finer and finer integration until the drift says that the rods are resolved."""
-    failure: ConvergenceError | None = None
-    # A rod that stretches is no stiffer than its EA: there is no end to the slack that counts.
-    slack = min(
-        max(slack, _STRETCH if rod.stretches else 0.0) for slack, rod in zip(robot.slacks(p), robot.rods, strict=True)
-    )
-    wanted = _WANTED_DRIFT[method] * min(1.0, slack / _TAUT)
-    for steps in _REFINEMENT:
-        if segments * steps > _MOST_STEPS:
-            break
-        try:
-            eq = solve_statics(robot, p, q, method=method, segments=segments, steps=steps, guess=guess)
-        except ConvergenceError as error:
-            failure = error
-            continue
-        if eq.drift <= wanted:
-            return eq
-        failure = ConvergenceError(
-            f"rods at p = {p} m, q = {q} rad are not resolved by {segments} segments of {steps} steps: the "
-            f"invariant m^2/2 + n.t drifts by {eq.drift:.1e} along a rod (wanted {wanted:.0e}); "
-            "they are taut, use more segments",
-            residual=eq.residual_norm,
-            iterations=eq.iterations,
-            last=eq.nodes,
+class Way(NamedTuple):
+    """How the statics are solved; ``refined``: with as many steps as the drift wants."""
+
+    method: str
+    shooting: Shooting
+    refined: bool
+
+    def solve(self, robot: Robot, p: np.ndarray, q: np.ndarray, guess: Equilibrium | np.ndarray | None) -> Equilibrium:
+        """Solve at a pose that is known to be in reach; see `solve_statics`."""
+        if self.refined:
+            return self._refined(robot, p, q, guess)
+        return self._solved(robot, p, q, self.shooting, guess)
+
+    def wanted_drift(self, robot: Robot, p: np.ndarray) -> float:
+        """Drift with which a solution counts as resolved."""
+        if not self.refined:
+            return math.inf
+        # A rod that stretches is no stiffer than its EA: there is no end to the slack that counts.
+        slack = min(
+            max(slack, _STRETCH if rod.stretches else 0.0)
+            for slack, rod in zip(robot.slacks(p), robot.rods, strict=True)
         )
-    assert failure is not None
-    raise failure
+        return _WANTED_DRIFT[self.method] * min(1.0, slack / _TAUT)
+
+    def _solved(
+        self,
+        robot: Robot,
+        p: np.ndarray,
+        q: np.ndarray,
+        shooting: Shooting,
+        guess: Equilibrium | np.ndarray | None,
+    ) -> Equilibrium:
+        solver = solver_of(robot, self.method, shooting)
+        if not isinstance(guess, Equilibrium):
+            solver.start(p, q, None if guess is None else _checked_nodes(guess, robot))
+            return solver.equilibrium(p, q)
+        if guess.robot.n_rods != robot.n_rods:
+            raise ValueError(f"guess has {guess.robot.n_rods} rods, the robot {robot.n_rods}")
+        if isinstance(solver, SingleShooting):
+            solver.start(guess.p, guess.q, guess.nodes)
+        else:
+            found = solver.first.near(guess, p, q) if solver.first.knows(guess) else None
+            if found is not None:
+                return found
+            solver.begin(guess)
+        solver.move(p, q)
+        return solver.equilibrium(p, q)
+
+    def _refined(
+        self, robot: Robot, p: np.ndarray, q: np.ndarray, guess: Equilibrium | np.ndarray | None
+    ) -> Equilibrium:
+        """Solve with finer and finer integration until the drift says that the rods are resolved."""
+        failure: ConvergenceError | None = None
+        wanted, segments = self.wanted_drift(robot, p), self.shooting.segments
+        for steps in _REFINEMENT:
+            if segments * steps > _MOST_STEPS:
+                break
+            try:
+                eq = self._solved(robot, p, q, Shooting(segments, steps, "rk8"), guess)
+            except ConvergenceError as error:
+                failure = error
+                continue
+            if eq.drift <= wanted:
+                return eq
+            failure = ConvergenceError(
+                f"rods at p = {p} m, q = {q} rad are not resolved by {segments} segments of {steps} steps: the "
+                f"invariant m^2/2 + n.t drifts by {eq.drift:.1e} along a rod (wanted {wanted:.0e}); "
+                "they are taut, use more segments",
+                residual=eq.residual_norm,
+                iterations=eq.iterations,
+                last=eq.nodes,
+            )
+        assert failure is not None
+        raise failure
+
+
+def chosen_way(robot: Robot, method: str | None, segments: int, steps: int | None, scheme: str) -> Way:
+    """Return the way that the arguments of `solve_statics` choose, or raise ValueError."""
+    method = method or default_method(robot)
+    refined = steps is None and method in _WANTED_DRIFT
+    shooting = checked_shooting(segments, 1 if steps is None else steps, scheme)
+    return Way(method, replace(shooting, scheme="rk8") if refined and scheme != "rk8" else shooting, refined)
 
 
 def default_method(robot: Robot) -> str:
@@ -151,7 +191,8 @@ def checked_shooting(segments: int, steps: int, scheme: str) -> Shooting:
 
 
 @per_thread(maxsize=32)
-def _solver(robot: Robot, method: str, shooting: Shooting) -> RodSolver | SingleShooting:
+def solver_of(robot: Robot, method: str, shooting: Shooting) -> RodSolver | SingleShooting:
+    """Return this thread's solver, for one call."""
     return make_solver(robot, method, shooting)
 
 
@@ -167,12 +208,6 @@ def make_solver(robot: Robot, method: str, shooting: Shooting, *, snapping: bool
         require_plain(robot, "method 'single_shooting'")
         return SingleShooting(robot, shooting.segments * shooting.steps, shooting.scheme)
     raise ValueError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
-
-
-def _of(robot: Robot, guess: Equilibrium) -> Equilibrium:
-    if guess.robot.n_rods != robot.n_rods:
-        raise ValueError(f"guess has {guess.robot.n_rods} rods, the robot {robot.n_rods}")
-    return guess
 
 
 def _checked_nodes(guess: np.ndarray, robot: Robot) -> np.ndarray:
