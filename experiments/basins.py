@@ -50,9 +50,9 @@ from pcr_mpc import (
     load_robot,
     solve_statics,
 )
-from pcr_mpc.plant import elastica
-from pcr_mpc.plant.chart import critical_load
-from pcr_mpc.plant.rod import sample_rod
+from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.chart import critical_load
+from pcr_mpc.plant.rods.equations import sample_rod
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt
 

@@ -44,8 +44,8 @@ from pcr_mpc import (
     solve_statics_batch,
 )
 from pcr_mpc.buffered import BufferedFunction
-from pcr_mpc.plant.numbers import Kind
-from pcr_mpc.plant.rod_method import closed_form_method, warm_step
+from pcr_mpc.plant.rods.method import closed_form_method, warm_step
+from pcr_mpc.plant.rods.numbers import Kind
 from pcr_mpc.report.tables import table
 
 ROOT = Path(__file__).parent.parent

@@ -14,7 +14,7 @@ from pcr_mpc.control.mpc import terminal_weight
 from pcr_mpc.loop.controllers import Decision
 from pcr_mpc.loop.feed_forward import feed_forward
 from pcr_mpc.loop.tracking import motor_limits
-from pcr_mpc.plant.symbolic import rod_unknowns, symbolic_dynamics
+from pcr_mpc.plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", UserWarning)  # which of its optional features are not installed

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from pcr_mpc import ConvergenceError, Equilibrium, Robot
-from pcr_mpc.plant.rod import sample_rod
+from pcr_mpc.plant.rods.equations import sample_rod
 
 # A fit that leaves more than this, in SI units, has found no equilibrium.
 ACCEPTED_RESIDUAL = 1e-4

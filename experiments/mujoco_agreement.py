@@ -27,9 +27,9 @@ from tqdm import tqdm
 
 from experiments.rod_inertia import QUICK_DURATION, RELEASES, STEP, furthest, start, swing
 from pcr_mpc import PCRError, Plant, Robot, load_robot, load_scene, make_controller, simulate
-from pcr_mpc.plant.hinge_chain import settled_chains
-from pcr_mpc.plant.mjcf import coordinates, mjcf
-from pcr_mpc.plant.mujoco_plant import MuJoCoPlant
+from pcr_mpc.plant.mujoco.hinge_chain import settled_chains
+from pcr_mpc.plant.mujoco.mjcf import coordinates, mjcf
+from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, ORANGE, PURPLE, plt
 

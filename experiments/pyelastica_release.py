@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.rod_inertia import STEP, start
 from pcr_mpc import Equilibrium, Robot, solve_statics
-from pcr_mpc.plant.rod import sample_rod
+from pcr_mpc.plant.rods.equations import sample_rod
 
 # Of the step, for waves that stretch an element and those that turn its section.
 COURANT = 0.8

@@ -36,8 +36,8 @@ from matplotlib.path import Path as MarkerPath
 from tqdm import tqdm
 
 from pcr_mpc import Equilibrium, PCRError, Robot, assess_stability, inverse_statics, load_robot
-from pcr_mpc.plant.rod_method import closed_form_method
-from pcr_mpc.plant.rod_solver import RodSolver
+from pcr_mpc.plant.rods.method import closed_form_method
+from pcr_mpc.plant.statics.solver import RodSolver
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import GREY, ORANGE, PURPLE, RED, SKY, plt
 

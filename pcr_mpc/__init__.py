@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from .loop.scene import Scene, load_scene
     from .loop.simulate import simulate
     from .loop.tracking import TrackingController, make_controller
-    from .plant.dynamics import Plant
-    from .plant.equilibria import Equilibria
-    from .plant.equilibrium import Equilibrium
-    from .plant.free_tip import forward_statics, inverse_statics
+    from .plant.motion.plant import Plant
+    from .plant.motion.rollout import Rollout, rollout
+    from .plant.motion.sensitivities import Sensitivities, sensitivities
     from .plant.robot import Robot, Rod, load_robot
-    from .plant.rollout import Rollout, rollout
-    from .plant.sensitivities import Sensitivities, sensitivities
-    from .plant.stability import Stability, all_equilibria, assess_stability, distance_to_fold
-    from .plant.statics import solve_statics
-    from .plant.statics_batch import solve_statics_batch
+    from .plant.statics.batch import solve_statics_batch
+    from .plant.statics.equilibria import Equilibria
+    from .plant.statics.equilibrium import Equilibrium
+    from .plant.statics.free_tip import forward_statics, inverse_statics
+    from .plant.statics.held_tip import solve_statics
+    from .plant.statics.stability import Stability, all_equilibria, assess_stability, distance_to_fold
 
 __all__ = [
     "CompilerError",
@@ -115,16 +115,16 @@ _WHERE = {
     "loop.scene": ("Scene", "load_scene"),
     "loop.simulate": ("simulate",),
     "loop.tracking": ("TrackingController", "make_controller"),
-    "plant.dynamics": ("Plant",),
-    "plant.equilibria": ("Equilibria",),
-    "plant.equilibrium": ("Equilibrium",),
-    "plant.free_tip": ("forward_statics", "inverse_statics"),
+    "plant.motion.plant": ("Plant",),
+    "plant.statics.equilibria": ("Equilibria",),
+    "plant.statics.equilibrium": ("Equilibrium",),
+    "plant.statics.free_tip": ("forward_statics", "inverse_statics"),
     "plant.robot": ("Robot", "Rod", "load_robot"),
-    "plant.rollout": ("Rollout", "rollout"),
-    "plant.sensitivities": ("Sensitivities", "sensitivities"),
-    "plant.stability": ("Stability", "all_equilibria", "assess_stability", "distance_to_fold"),
-    "plant.statics": ("solve_statics",),
-    "plant.statics_batch": ("solve_statics_batch",),
+    "plant.motion.rollout": ("Rollout", "rollout"),
+    "plant.motion.sensitivities": ("Sensitivities", "sensitivities"),
+    "plant.statics.stability": ("Stability", "all_equilibria", "assess_stability", "distance_to_fold"),
+    "plant.statics.held_tip": ("solve_statics",),
+    "plant.statics.batch": ("solve_statics_batch",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 

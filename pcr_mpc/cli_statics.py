@@ -9,12 +9,12 @@ import sys
 from pathlib import Path
 
 from .files import require_free, stamped, write_text
-from .plant.equilibrium import Equilibrium
-from .plant.free_tip import forward_statics, inverse_statics
-from .plant.mjcf import mjcf
+from .plant.mujoco.mjcf import mjcf
 from .plant.robot import Robot, load_robot
-from .plant.stability import all_equilibria, assess_stability
-from .plant.statics import solve_statics
+from .plant.statics.equilibrium import Equilibrium
+from .plant.statics.free_tip import forward_statics, inverse_statics
+from .plant.statics.held_tip import solve_statics
+from .plant.statics.stability import all_equilibria, assess_stability
 
 
 def solve_pose(options: argparse.Namespace) -> int:

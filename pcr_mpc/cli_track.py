@@ -21,7 +21,7 @@ from .loop.scene import load_scene
 from .loop.simulate import simulate
 from .loop.simulated_plant import SimulatedPlant
 from .loop.tracking import make_controller
-from .plant.mujoco_plant import MuJoCoPlant
+from .plant.mujoco.plant import MuJoCoPlant
 from .report.plots import animate_run, plot_run
 from .report.tables import summary_table
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import solve_statics
-from pcr_mpc.plant import elastica
-from pcr_mpc.plant.chart import critical_load
+from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.chart import critical_load
 
 from . import taylor_rod
 from .conftest import random_pose

@@ -252,7 +252,7 @@ def test_a_rung_that_fails_on_the_way_is_not_taken(release, monkeypatch):
             raise ConvergenceError("made up", residual=1.0, iterations=1, last=None)
         return step(self, x, u, f_ext)
 
-    monkeypatch.setattr("pcr_mpc.plant.dynamics.Plant.step", failing)
+    monkeypatch.setattr("pcr_mpc.plant.motion.plant.Plant.step", failing)
     measured = bench.measure(bench.rungs[0])
     assert measured.error == math.inf
     assert "made up" in measured.failure

@@ -8,9 +8,9 @@ from scipy.linalg import eigh, null_space
 from scipy.optimize import brentq
 
 from pcr_mpc import ConvergenceError, ModelError, Plant, inverse_statics, load_robot, solve_statics
-from pcr_mpc.plant.distributed import DistributedRods
-from pcr_mpc.plant.rod import sample_rod
-from pcr_mpc.plant.strain_modes import StrainModes
+from pcr_mpc.plant.motion.distributed import DistributedRods
+from pcr_mpc.plant.rods.equations import sample_rod
+from pcr_mpc.plant.rods.strain_modes import StrainModes
 
 from .conftest import MODELS
 from .test_inertia import rollout, state

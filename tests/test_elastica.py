@@ -6,9 +6,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from pcr_mpc import solve_statics
-from pcr_mpc.plant import elastica
-from pcr_mpc.plant.chart import held_shapes
-from pcr_mpc.plant.rod import sample_rod
+from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.chart import held_shapes
+from pcr_mpc.plant.rods.equations import sample_rod
 
 from .conftest import DATA
 

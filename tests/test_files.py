@@ -16,7 +16,7 @@ from pcr_mpc.cli import main
 from pcr_mpc.cli_parser import METHODS
 from pcr_mpc.errors import OutputError
 from pcr_mpc.files import ours, replacing, require_free, results, stamped, write_text
-from pcr_mpc.plant import statics
+from pcr_mpc.plant.statics import held_tip as statics
 from pcr_mpc.study.chosen_rung import _renewed
 from pcr_mpc.study.tuning_file import write_tuning
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import simpson
 
 from pcr_mpc import ConvergenceError, Plant, inverse_statics, load_robot
-from pcr_mpc.plant.integrators import INTEGRATORS
+from pcr_mpc.plant.motion.integrators import INTEGRATORS
 
 from .conftest import MODELS
 

@@ -27,9 +27,9 @@ from pcr_mpc import (
 )
 from pcr_mpc.cli import main
 from pcr_mpc.errors import ReadOnlyError
-from pcr_mpc.plant.hinge_chain import settled_chains
-from pcr_mpc.plant.mjcf import coordinates, mjcf
-from pcr_mpc.plant.mujoco_plant import _WARNINGS, MuJoCoPlant
+from pcr_mpc.plant.mujoco.hinge_chain import settled_chains
+from pcr_mpc.plant.mujoco.mjcf import coordinates, mjcf
+from pcr_mpc.plant.mujoco.plant import _WARNINGS, MuJoCoPlant
 
 from .conftest import CONTROLLERS, MODELS
 from .test_distributed import distance, released

@@ -17,8 +17,8 @@ from pcr_mpc import (
     rollout,
     solve_statics,
 )
-from pcr_mpc.plant.numbers import Kind
-from pcr_mpc.plant.rod import Layout
+from pcr_mpc.plant.rods.equations import Layout
+from pcr_mpc.plant.rods.numbers import Kind
 
 from .conftest import MODELS
 from .numbers_of import number_of, with_number

@@ -195,7 +195,7 @@ def test_wrong_payloads_are_refused(scene, tmp_path, pair):
 
 def test_mujoco_carries_it_too(pair, centre):
     pytest.importorskip("mujoco")
-    from pcr_mpc.plant.mujoco_plant import MuJoCoPlant
+    from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
 
     ends = []
     for plant in (MuJoCoPlant(pair, links=40), Plant(pair, inertia="full", integrator="gauss", dt=1e-3)):

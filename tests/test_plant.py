@@ -3,7 +3,7 @@ import pytest
 from scipy.linalg import expm
 
 from pcr_mpc import ConvergenceError, PCRError, Plant, UnreachableError, inverse_statics, load_robot
-from pcr_mpc.plant.dynamics import INTEGRATORS
+from pcr_mpc.plant.motion.plant import INTEGRATORS
 
 from .conftest import MODELS
 

@@ -98,7 +98,7 @@ def test_a_carried_payload_is_taken_away_by_a_reset(pair, centre, x0, method):
 
 
 def test_a_payload_of_mujoco_is_taken_away_by_a_reset(pair, centre, x0):
-    from pcr_mpc.plant.mujoco_plant import MuJoCoPlant
+    from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
 
     used, fresh = (MuJoCoPlant(pair, links=10) for _ in range(2))
     used.reset(x0, centre)
@@ -113,7 +113,7 @@ def test_a_payload_of_mujoco_is_taken_away_by_a_reset(pair, centre, x0):
 
 
 def test_snaps_and_rungs_of_mujoco_are_empty(pair):
-    from pcr_mpc.plant.mujoco_plant import MuJoCoPlant
+    from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
 
     plant = MuJoCoPlant(pair, links=10)
     assert (plant.snaps, plant.rungs) == ([], {})

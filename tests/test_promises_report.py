@@ -9,7 +9,7 @@ import pytest
 
 from pcr_mpc import HoldMotors, cli_study, load_scene, load_tuning, simulate
 from pcr_mpc.cli import main
-from pcr_mpc.plant.stability import assess_stability
+from pcr_mpc.plant.statics.stability import assess_stability
 from pcr_mpc.report.choice_tables import choice_record, choice_table
 from pcr_mpc.report.tables import (
     equilibria_table,

@@ -8,7 +8,7 @@ import pytest
 from pcr_mpc import HoldMotors, SimulationError, load_scene, simulate
 from pcr_mpc.control.plan import Plan
 from pcr_mpc.loop.controllers import Decision, Replay
-from pcr_mpc.plant.rod_solver import Snap
+from pcr_mpc.plant.statics.solver import Snap
 
 from .conftest import MODELS
 

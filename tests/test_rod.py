@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from pcr_mpc.plant.rod import propagation, sample_rod
+from pcr_mpc.plant.rods.equations import propagation, sample_rod
 
 START = np.array([0.3, -9.0, 4.0, 5.0])  # theta, n_x, n_y, m
 

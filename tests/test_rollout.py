@@ -15,7 +15,7 @@ from pcr_mpc import (
     rollout,
     solve_statics,
 )
-from pcr_mpc.plant.integrators import INTEGRATORS
+from pcr_mpc.plant.motion.integrators import INTEGRATORS
 
 from .conftest import MODELS
 
@@ -146,8 +146,8 @@ def test_every_robot_has_its_own_force_at_every_step(pair, centre):
 
 
 def test_more_steps_than_one_call_takes(pair, centre, monkeypatch):
-    monkeypatch.setattr("pcr_mpc.plant.rollout._STEPS", 25)
-    monkeypatch.setattr("pcr_mpc.plant.rollout._MOST_STEPS", 50)
+    monkeypatch.setattr("pcr_mpc.plant.motion.rollout._STEPS", 25)
+    monkeypatch.setattr("pcr_mpc.plant.motion.rollout._MOST_STEPS", 50)
     x, inputs = start_at(centre), np.stack([brisk(STEPS), -brisk(STEPS), 0.5 * brisk(STEPS)])
     plant = Plant(pair, inertia="condensed")
     result = rollout(plant, x, inputs, guess=centre)

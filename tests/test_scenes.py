@@ -161,6 +161,6 @@ def test_pick_and_place_rests_at_both_ends_and_peaks_as_stated():
 def test_tunings_know_the_plants_methods():
     """The controller may not import the plant, so it spells the names out once more."""
     from pcr_mpc.control import tuning
-    from pcr_mpc.plant import rod
+    from pcr_mpc.plant.rods import equations as rod
 
     assert tuple(rod.SCHEMES) == tuning.SCHEMES

@@ -21,7 +21,7 @@ from pcr_mpc.control.mpc import riccati
 from pcr_mpc.control.observer import DisturbanceObserver
 from pcr_mpc.linearisation.pose_limits import LimitWatch, PoseLimits
 from pcr_mpc.loop.tracking import make_controller, motor_limits
-from pcr_mpc.plant.stability import all_equilibria, assess_stability, distance_to_fold
+from pcr_mpc.plant.statics.stability import all_equilibria, assess_stability, distance_to_fold
 
 from .conftest import CONTROLLERS, MODELS
 from .similar import Units

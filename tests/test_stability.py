@@ -11,11 +11,11 @@ from pcr_mpc import (
     inverse_statics,
     solve_statics,
 )
-from pcr_mpc.plant import elastica
-from pcr_mpc.plant.chart import critical_load, stable_shapes
-from pcr_mpc.plant.multiple_shooting import rod_newton
-from pcr_mpc.plant.rod import sample_rod
-from pcr_mpc.plant.stability import count_conjugate_points
+from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.chart import critical_load, stable_shapes
+from pcr_mpc.plant.rods.equations import sample_rod
+from pcr_mpc.plant.rods.multiple_shooting import rod_newton
+from pcr_mpc.plant.statics.stability import count_conjugate_points
 
 from .conftest import DATA, random_pose
 

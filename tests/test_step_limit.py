@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import PCRError, Plant, rollout
-from pcr_mpc.plant.step_limit import longest_step
+from pcr_mpc.plant.motion.step_limit import longest_step
 
 
 def amplification(integrator, omega, g, dt):

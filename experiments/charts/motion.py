@@ -27,7 +27,7 @@ from experiments.literal_reading import LiteralReading, Solution
 from experiments.rod_inertia import RELEASES, STEP, start
 from pcr_mpc import PCRError, Plant, Robot
 from pcr_mpc.loop.simulated_plant import SimulatedPlant
-from pcr_mpc.plant.rollout import rollout
+from pcr_mpc.plant.motion.rollout import rollout
 
 YARDSTICK, MUJOCO, ELASTICA = "yardstick", "MuJoCo", "PyElastica"
 _REPEATS = 5  # of a release in one call
@@ -120,7 +120,7 @@ def _peers(robot: Robot, release: str, plan: Plan) -> dict[Key, Callable[[], Row
     """Other engines, if they are installed (extras ``mujoco`` and ``peers``)."""
     found: dict[Key, Callable[[], Row]] = {}
     if find_spec("mujoco"):
-        from pcr_mpc.plant.mujoco_plant import MuJoCoPlant
+        from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
 
         for links in plan.links:
             plant = partial(MuJoCoPlant, robot, links=links, dt=STEP)

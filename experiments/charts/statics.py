@@ -19,9 +19,9 @@ from experiments.charts.points import Key, Row, times
 from experiments.charts.statics_poses import CLASSES, Pose, make_poses
 from experiments.literal_reading import LiteralReading
 from pcr_mpc import Equilibrium, PCRError, Robot
-from pcr_mpc.plant.rod_solver import RodSolver
-from pcr_mpc.plant.single_shooting import SingleShooting
-from pcr_mpc.plant.statics import checked_shooting, make_solver
+from pcr_mpc.plant.statics.held_tip import checked_shooting, make_solver
+from pcr_mpc.plant.statics.single_shooting import SingleShooting
+from pcr_mpc.plant.statics.solver import RodSolver
 
 DERIVATIVES = "bent: F, K and G"
 LITERAL, LITERAL_AT_ONCE = "literal reading", "literal reading, at once"

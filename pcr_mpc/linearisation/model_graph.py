@@ -8,10 +8,10 @@ from typing import Any
 import casadi as ca
 
 from ..buffered import graph_cache
-from ..plant.mass_matrix import mass_calls
-from ..plant.rod_method import warm_calls
-from ..plant.step_graph import StepModel
-from ..plant.weight import robot_weight
+from ..plant.motion.mass_matrix import mass_calls
+from ..plant.motion.step_graph import StepModel
+from ..plant.rods.method import warm_calls
+from ..plant.statics.weight import robot_weight
 from .linearise import discretisation
 
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..buffered import BufferedFunction
 from ..frozen import Remade, set_once
-from ..plant import elastica
-from ..plant.chart import LEAST_CRITICAL_LOAD, critical_load, critical_load_slope, rough_critical_load
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
-from ..plant.robot_state import RobotState
+from ..plant.motion.plant import Plant
+from ..plant.rods import elastica
+from ..plant.rods.chart import LEAST_CRITICAL_LOAD, critical_load, critical_load_slope, rough_critical_load
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.state import RobotState
 from .linear_limits import KINDS, LinearLimits
 
 # How close to a limit a pose must come before the limit is linearised: its controller then looks a horizon ahead.

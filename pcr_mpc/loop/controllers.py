@@ -10,7 +10,7 @@ import numpy as np
 from ..control.plan import Plan
 from ..errors import checked_period
 from ..frozen import read_only
-from ..plant.equilibrium import Equilibrium
+from ..plant.statics.equilibrium import Equilibrium
 
 
 @dataclass(frozen=True, eq=False)

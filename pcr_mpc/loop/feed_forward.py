@@ -11,11 +11,11 @@ from .. import interrupt
 from ..control.qp import Reference
 from ..errors import ConvergenceError, PCRError
 from ..frozen import Frozen
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
-from ..plant.free_tip import inverse_statics
+from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
-from ..plant.stability import least_rod_margin
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.free_tip import inverse_statics
+from ..plant.statics.stability import least_rod_margin
 from .scene import Scene
 from .trajectory import sampled
 

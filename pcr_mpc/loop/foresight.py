@@ -13,8 +13,8 @@ from ..compiled import fastest
 from ..errors import ConvergenceError, PCRError
 from ..linearisation.linear_model import LinearModels
 from ..linearisation.linearise import linearise
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
+from ..plant.motion.plant import Plant
+from ..plant.statics.equilibrium import Equilibrium
 from .foresight_graph import Places, foresight_graph
 
 

@@ -18,8 +18,8 @@ from ..buffered import graph_cache
 from ..control.observer import correction
 from ..linearisation.linearise import STIFFEST
 from ..linearisation.model_graph import force_graph, model_graph, sizes
-from ..plant.rod_follower import BRANCH_CHANGE
-from ..plant.step_graph import LARGEST_DRIFT, StepModel
+from ..plant.motion.step_graph import LARGEST_DRIFT, StepModel
+from ..plant.rods.follower import BRANCH_CHANGE
 
 # What a verdict of `model_graph` may be: the pose is solved far better than a controller can tell, K and G to 1e-4.
 _SOLVED, _DERIVATIVES = 1e-8, 1e-4

@@ -20,10 +20,10 @@ from ..files import require_folder, results
 from ..frozen import Frozen, read_only
 from ..linearisation.linear_limits import KINDS
 from ..plain import plain
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
+from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
-from ..plant.stability import least_rod_margin
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.stability import least_rod_margin
 from .finding import verified
 from .record import ARRAYS, FORMAT, from_text, record, write_csv
 from .scene import Scene

@@ -11,10 +11,10 @@ import numpy as np
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, UnreachableError
 from ..linearisation.pose_limits import PoseLimits
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
-from ..plant.free_tip import forward_statics, inverse_statics
+from ..plant.motion.plant import Plant
 from ..plant.robot import Robot, load_robot
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.free_tip import forward_statics, inverse_statics
 from ..toml_table import Table, read_toml
 from .scene_checks import LATE, check_scene, is_multiple
 from .settings import Finding, Need, Payload, PlantSettings, read_finding, read_need, read_payload, read_plant

@@ -8,12 +8,12 @@ import numpy as np
 
 from ..errors import check_numbers
 from ..methods import METHODS
-from ..plant.dynamics import INTEGRATORS, ON_SNAP, Plant
-from ..plant.inertia import INERTIAS
+from ..plant.motion.plant import INTEGRATORS, ON_SNAP, Plant
 from ..plant.robot import Robot
-from ..plant.rod import SCHEMES
-from ..plant.statics import default_method
-from ..plant.weight import WEIGHTS
+from ..plant.rods.equations import SCHEMES
+from ..plant.rods.inertia import INERTIAS
+from ..plant.statics.held_tip import default_method
+from ..plant.statics.weight import WEIGHTS
 from ..toml_table import Table
 
 RODS = ("plain", "as_built")

@@ -6,8 +6,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..plant.equilibrium import Equilibrium
-from ..plant.rod_solver import Snap
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.solver import Snap
 
 
 class SimulatedPlant(Protocol):

@@ -8,9 +8,9 @@ import numpy as np
 
 from ..errors import PCRError
 from ..frozen import Remade
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
+from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
+from ..plant.statics.equilibrium import Equilibrium
 
 _LARGEST_STEP = 0.1  # rad
 _ROUGH = 1e-2

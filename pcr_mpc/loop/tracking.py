@@ -22,10 +22,10 @@ from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel, LinearModels
 from ..linearisation.linearise import linearise
 from ..linearisation.pose_limits import LimitWatch
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
+from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
-from ..plant.symbolic import rod_unknowns, symbolic_dynamics
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 from .controllers import Controller, Decision, HoldMotors
 from .feed_forward import InverseDynamics, feed_forward, held
 from .foresight import Foresight, Outlook

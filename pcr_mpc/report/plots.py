@@ -12,8 +12,8 @@ from tqdm import tqdm
 from .. import interrupt
 from ..files import replacing
 from ..loop.run import Run
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
+from ..plant.motion.plant import Plant
+from ..plant.statics.equilibrium import Equilibrium
 from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt, save_figure
 from .tables import without_rounding
 

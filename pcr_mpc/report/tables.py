@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..plant.equilibrium import Equilibrium
-from ..plant.stability import assess_stability
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.stability import assess_stability
 from ..study.tuning_space import Search
 from ..study.tuning_study import Chosen
 

@@ -15,11 +15,11 @@ import numpy as np
 from ..errors import PCRError
 from ..loop.scene import Scene
 from ..loop.settings import PlantSettings
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
-from ..plant.free_tip import inverse_statics
+from ..plant.motion.plant import Plant
 from ..plant.robot import Rod
-from ..plant.statics import solve_statics
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.free_tip import inverse_statics
+from ..plant.statics.held_tip import solve_statics
 from .rungs import levels
 
 _POSES = 9  # along the motion

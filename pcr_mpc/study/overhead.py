@@ -14,11 +14,11 @@ from .. import interrupt
 from ..buffered import BufferedFunction
 from ..compiled import has_compiler
 from ..errors import CompilerError
-from ..plant.dynamics import Plant
-from ..plant.equilibrium import Equilibrium
+from ..plant.motion.plant import Plant
+from ..plant.motion.rollout import rollout
+from ..plant.motion.step_graph import step_function
 from ..plant.robot import Robot
-from ..plant.rollout import rollout
-from ..plant.step_graph import step_function
+from ..plant.statics.equilibrium import Equilibrium
 
 _BATCHES, _CALLS = 15, 400
 _ROLLED, _ROLLOUTS = 2000, 6

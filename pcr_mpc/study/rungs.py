@@ -11,8 +11,8 @@ from itertools import product
 
 from ..loop.scene import Scene
 from ..loop.settings import PAYLOADS, RODS, PlantSettings
-from ..plant.inertia import INERTIAS
-from ..plant.weight import WEIGHTS
+from ..plant.rods.inertia import INERTIAS
+from ..plant.statics.weight import WEIGHTS
 
 # Steps in a control period: some, for what happens within it, such as a late decision. Force evaluations a step, which
 # is what a step costs.

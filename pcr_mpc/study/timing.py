@@ -15,7 +15,7 @@ from ..loop.scene import Scene
 from ..loop.simulate import simulate
 from ..loop.tracking import TrackingController, make_controller
 from ..methods import METHODS
-from ..plant.dynamics import DERIVATIVE_ACCURACY, Plant
+from ..plant.motion.plant import DERIVATIVE_ACCURACY, Plant
 from .machine import machine, versions
 from .overhead import call_overhead
 from .stopwatch import WARM_UP, Times, distribution, measure

@@ -1,0 +1,4 @@
+"""The same robot in another engine.
+
+Imports `motion`, `statics`, `rods` and `robot`.
+"""
