@@ -9,10 +9,10 @@ track: $(READY)  ## follow the figure of eight in closed loop; pictures and tabl
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml
 
 test: $(READY)  ## the default test run
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
 test-slow: $(READY)  ## the tests marked slow
-	$(BIN)/python -m pytest -q -m slow
+	$(BIN)/python -m pytest -q -m slow -n auto --dist loadfile
 
 lint: $(READY)  ## style, types, layers
 	$(BIN)/ruff check .
