@@ -15,6 +15,8 @@ from ..buffered import graph_cache
 
 # Graphs up to this many periods become one list of instructions; longer ones stay matrices, which are built at once.
 _UNROLLED = 12
+# Beyond it are the solvers' infinities.
+_LARGEST = 1e30
 
 
 def _split(column: Any, ends: list[int]) -> list[Any]:
@@ -57,7 +59,8 @@ def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool
     -------
     casadi.Function
         (models (size, 1 or N), x (4 + n), states (4 + n, N), inputs (n, N), u_previous (n), weights (4), T,
-        bounds (n, 4), dt) -> P as `QuadraticProgram` holds it, q, l, u.
+        bounds (n, 4), dt) -> P as `QuadraticProgram` holds it, q, l, u, and [|P|, |q|, 1 if all is finite and no
+        bounds cross, else 0].
     """
     n_states = 4 + n
     packed = ca.MX.sym("models", n_states * (n_states + 1 + n + 2), models)
@@ -109,7 +112,13 @@ def condensing(horizon: int, n: int, models: int, *, velocity: bool, angle: bool
         first + ca.repmat(change, horizon, 1),
         ca.repmat((upper - x[4:]) / dt, horizon, 1),
     ]
-    results = [ca.vertcat(*triangle), ca.vertcat(*gradient), ca.vertcat(*l_all), ca.vertcat(*u_all)]
+    p, q, l, u = (ca.vertcat(*parts) for parts in (triangle, gradient, l_all, u_all))  # noqa: E741
+    sizes = ca.norm_2(p), ca.norm_2(q)
+    # So written that NaN is not sound.
+    sound = ca.logic_and(ca.mmin(u - l) >= 0, ca.norm_inf(ca.vertcat(l, u)) < _LARGEST)
+    for size in sizes:
+        sound = ca.logic_and(sound, size < _LARGEST)
+    results = [p, q, l, u, ca.vertcat(*sizes, sound)]
     arguments = [packed, x, states, inputs, previous, weights, terminal, bounds, dt]
     graph = ca.Function("condense", arguments, [ca.densify(result) for result in results])
     return graph.expand("condense", {"cse": True}) if horizon <= _UNROLLED else graph
@@ -124,7 +133,7 @@ def checking(horizon: int, n: int, models: int) -> Any:
     casadi.Function
         (models (size, 1 or N), x (4 + n), inputs (n, N), multipliers of rates and changes (2 N n), P, q, l, u, bounds
         (n, 4), dt) -> states (4 + n, N + 1), [largest violation of the rows of rates and changes, largest entry of
-        P U + q + A'y, largest excess of an angle over its limits [rad]].
+        P U + q + A'y, largest excess of an angle over its limits [rad], largest multipliers of rates and of changes].
     """
     n_states, size = 4 + n, horizon * n
     packed = ca.MX.sym("models", n_states * (n_states + 1 + n + 2), models)
@@ -146,5 +155,9 @@ def checking(horizon: int, n: int, models: int) -> Any:
     hessian = ca.MX(ca.Sparsity.upper(size), upper_triangle)
     dual = ca.norm_inf(ca.triu2symm(hessian) @ u + q + pull)
     arguments = [packed, x, inputs, y, upper_triangle, q, lower, upper, bounds, dt]
-    graph = ca.Function("check", arguments, [ca.horzcat(*states), ca.vertcat(primal, dual, excess)])
+    graph = ca.Function(
+        "check",
+        arguments,
+        [ca.horzcat(*states), ca.vertcat(primal, dual, excess, ca.norm_inf(of_rates), ca.norm_inf(of_changes))],
+    )
     return graph.expand("check", {"cse": True}) if horizon <= _UNROLLED else graph

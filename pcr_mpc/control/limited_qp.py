@@ -228,7 +228,10 @@ class LimitedQP:
 def active_kinds(y: np.ndarray, groups: np.ndarray) -> tuple[str, ...]:
     """Kinds of limits that have a multiplier; ``groups`` names the kind of each row, and may be shorter than y."""
     y = np.abs(y[: len(groups)])
-    largest = float(y.max(initial=0.0))
-    if largest < 1e-9:
-        return ()
-    return tuple(dict.fromkeys(groups[y > 1e-6 * largest].tolist()))
+    return active_of({kind: float(y[groups == kind].max()) for kind in dict.fromkeys(groups.tolist())})
+
+
+def active_of(pulls: dict[str, float]) -> tuple[str, ...]:
+    """Kinds of limits whose largest multipliers count."""
+    largest = max(pulls.values(), default=0.0)
+    return () if largest < 1e-9 else tuple(kind for kind, pull in pulls.items() if pull > 1e-6 * largest)

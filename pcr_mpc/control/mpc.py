@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
-from scipy.linalg.blas import dnrm2
 
 from ..errors import InfeasibleError, checked_array, checked_vector
 from ..frozen import set_once
@@ -189,7 +188,7 @@ class LinearMPC:
         """
         assert self._workspace is not None
         n = len(u_previous)
-        problem = self.limits, float(dnrm2(qp.P)), float(dnrm2(qp.q))
+        problem = self.limits, *qp.sizes[:2]
         if not self._continues(*problem):
             self._forget()
         warm = None if self._last is None or self._problem is None else _shifted(self._last.inputs).ravel()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -50,6 +51,8 @@ class QuadraticProgram:
         same for every QP (see `constraint_matrix`).
     l, u : ndarray, shape (3 N n,)
         Bounds.
+    sizes : (float, float, float), optional
+        |P|, |q|, and 1 if all entries are finite and no bounds cross, as the graph that made them has found.
     """
 
     P: np.ndarray
@@ -57,6 +60,7 @@ class QuadraticProgram:
     A: sp.csc_matrix
     l: np.ndarray  # noqa: E741  OSQP's name
     u: np.ndarray
+    sizes: tuple[float, float, float] = (math.nan, math.nan, 0.0)
 
 
 def build_qp(
@@ -119,8 +123,9 @@ def assemble(
     bounds[:] = motor_bounds(limits)
     dt[0] = models.dt
     function()
-    p, q, lower, upper = function.outputs
-    return QuadraticProgram(p.copy(), q.copy(), constraint_matrix(tuning.horizon, n), lower.copy(), upper.copy())
+    p, q, lower, upper = (output.copy() for output in function.outputs[:4])
+    sizes = tuple(function.outputs[4].tolist())
+    return QuadraticProgram(p, q, constraint_matrix(tuning.horizon, n), lower, upper, sizes)
 
 
 @per_thread(maxsize=32)

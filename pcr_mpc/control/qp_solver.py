@@ -117,6 +117,8 @@ class CheckedQP(ABC):
         l: np.ndarray,  # noqa: E741
         u: np.ndarray,
         A: np.ndarray | None = None,
+        *,
+        sound: bool = False,
     ) -> None:
         """Replace the data.
 
@@ -129,6 +131,8 @@ class CheckedQP(ABC):
             Bounds; infinite entries are allowed.
         A : ndarray, shape (stored entries of A,), optional
             Column by column, in the order of the first A. None: as they are.
+        sound : bool
+            The graph that made P, q, l and u has checked them, and they are copied as they are.
 
         Raises
         ------
@@ -138,6 +142,11 @@ class CheckedQP(ABC):
             Some bounds cross; ``limit`` is the row, and the old data stay. Or P is not convex: then the old data are
             lost, and good ones are needed before it solves again.
         """
+        if sound and P is not None and A is None:
+            P, q, l, u = P.copy(), q.copy(), l.copy(), u.copy()  # noqa: E741
+            self._hand_over(P, q, l, u, None)
+            self._data = P, q, l, u
+            return
         q = _checked("q", q, self.n)
         if (P is None) != self._identity:
             raise ValueError("P is the identity of this solver" if self._identity else "P is missing")

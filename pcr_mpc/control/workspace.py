@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +14,13 @@ from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel, LinearModels
 from .condensing import checking
 from .daqp_solver import DAQPSolver
-from .limited_qp import Limited, LimitedQP, active_kinds
+from .limited_qp import Limited, LimitedQP, active_of
 from .osqp_solver import QPSolver
 from .qp import QuadraticProgram, constraint_matrix, motor_bounds
 from .qp_solver import Solution
 from .tuning import Limits, Tuning
 
+_RATES = ("rate", "rate change")
 _FEWEST_ITERATIONS = 10  # with which a solver is tried at all
 
 
@@ -38,7 +40,6 @@ class Workspace:
         rates = constraint_matrix(tuning.horizon, self.n)[: 2 * tuning.horizon * self.n].tocsc()
         solver = DAQPSolver if tuning.solver == "daqp" else QPSolver
         self._rates_only = solver(rates, tuning.tolerance, tuning.max_iterations)
-        self._groups = np.repeat(["rate", "rate change"], tuning.horizon * self.n)
         self._limited: dict[tuple[str, ...], LimitedQP] = {}
         self._limits_matter = False  # in the last plan, beside those on the rates
         self._spent, self._inside = 0, 0.0  # iterations and seconds of the solver in this control step
@@ -84,22 +85,22 @@ class Workspace:
         if not self._limits_matter:
             n_rates = self._rates_only.m
             try:
-                self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates])
+                self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates], sound=qp.sizes[2] > 0.0)
                 if warm is not None:
                     self._rates_only.warm_start(warm)
                 solution = self._rates_only.solve(certified=False)
             except InfeasibleError as error:
                 self._count(error)
             else:
-                states, primal, dual, broken = self.check(x, models, solution, qp, limits)
-                solution = replace(solution, primal_residual=primal, dual_residual=dual)
+                states, primal, dual, broken, *pulls = self.check(x, models, solution, qp, limits)
+                solution = Solution(solution.x, solution.y, solution.iterations, solution.run_time, primal, dual)
                 if pose_limits is not None:
                     rows = states[1:] @ pose_limits.C.T
                     broken = max(
                         broken, float((pose_limits.lower - rows).max()), float((rows - pose_limits.upper).max())
                     )
                 if broken <= self._tuning.tolerance * self.dt:
-                    return Limited(solution.x, states, {}, active_kinds(solution.y, self._groups), solution)
+                    return Limited(solution.x, states, {}, active_of(dict(zip(_RATES, pulls, strict=True))), solution)
                 self._spent, self._inside, warm = solution.iterations, solution.run_time, solution.x
         return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
 
@@ -134,7 +135,7 @@ class Workspace:
             raise
         self._spent += answer.solution.iterations
         self._inside += answer.solution.run_time
-        self._limits_matter = not set(answer.active) <= {"rate", "rate change"}
+        self._limits_matter = not set(answer.active) <= {*_RATES}
         solution = replace(answer.solution, iterations=self._spent, run_time=self._inside)
         return replace(answer, solution=solution)
 
@@ -161,8 +162,9 @@ class Check:
 
     def __call__(
         self, x: np.ndarray, models: LinearModels, solution: Solution, qp: QuadraticProgram, limits: Limits
-    ) -> tuple[np.ndarray, float, float, float]:
-        """States, shape (N + 1, 4 + n), residuals of the rates' rows and of the gradient, excess of an angle [rad]."""
+    ) -> tuple[Any, ...]:
+        """States, shape (N + 1, 4 + n), residuals of rows and gradient, excess of an angle [rad], and the
+        largest multipliers of rates and of changes."""
         graph = self._graph(len(models))
         _, _, _, y, p, q, lower, upper, bounds, _ = graph.inputs
         y[:], p[:], q[:], lower[:], upper[:] = solution.y, qp.P, qp.q, qp.l, qp.u
@@ -170,8 +172,7 @@ class Check:
             self._limits, self._bounds = limits, motor_bounds(limits)
         bounds[:] = self._bounds
         states = self.states(x, models, solution.x)
-        primal, dual, excess = graph.outputs[1].tolist()
-        return states, primal, dual, excess
+        return states, *graph.outputs[1].tolist()
 
     def states(self, x: np.ndarray, models: LinearModels, inputs: np.ndarray) -> np.ndarray:
         """States at the ends of the periods, x first, shape (N + 1, 4 + n); one model or N of them."""

@@ -39,7 +39,7 @@ class Outlook:
     signs : ndarray
         See `LimitWatch.far`.
     qp : list of ndarray
-        P, q, l, u, if wanted.
+        P, q, l, u and sizes, if wanted (see `condensing`).
     """
 
     ahead: np.ndarray
@@ -113,7 +113,7 @@ class Foresight:
             shift=found["moved_shift"],
             states=_rows(found["wanted"]),
             signs=found["signs"],
-            qp=[found[name] for name in ("P", "q", "l", "u") if name in found],
+            qp=[found[name] for name in ("P", "q", "l", "u", "sizes") if name in found],
         )
 
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:

@@ -119,7 +119,7 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
     if condense is not None:
         of_plan = models[:, places.delay :]
         outputs |= zip(
-            ("P", "q", "l", "u"),
+            ("P", "q", "l", "u", "sizes"),
             condense(of_plan, ahead, states, given.inputs, given.u_previous, given.weights, given.terminal,
                      given.bounds, given.dt),
             strict=True,

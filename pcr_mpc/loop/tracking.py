@@ -301,8 +301,9 @@ class TrackingController(Remade):
             return self._law.fall_back(failure, estimate, Reference(states, inputs, forces + force), self._u), estimate
         window, ahead = Reference(outlook.states.copy(), inputs, forces + force), outlook.ahead.copy()
         if isinstance(self._law, LinearMPC):
-            p, q, lower, upper = outlook.qp
-            qp = QuadraticProgram(p, q, constraint_matrix(horizon, self.robot.n_rods), lower, upper)
+            p, q, lower, upper, sizes = outlook.qp
+            rows = constraint_matrix(horizon, self.robot.n_rods)
+            qp = QuadraticProgram(p, q, rows, lower, upper, tuple(sizes.tolist()))
             models = outlook.models.copy()
             return self._law.decide(qp, ahead, models, window, self._u, pose_limits, began), ahead
         return self._law.solve(ahead, outlook.models.copy(), window, self._u, pose_limits), ahead
