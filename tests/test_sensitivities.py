@@ -107,7 +107,8 @@ COARSE = {"segments": 3, "scheme": "rk4", "steps": 2}
 
 
 @pytest.mark.parametrize(
-    "integrator", ["semi_implicit_euler", "velocity_verlet", pytest.param("rk4", marks=pytest.mark.slow)]
+    "integrator",
+    ["velocity_verlet", *(pytest.param(name, marks=pytest.mark.slow) for name in ("semi_implicit_euler", "rk4"))],
 )
 def test_differences_for_rods_that_are_not_plain(knotted, bent, integrator):
     check(knotted, solve_statics(knotted, bent.p, bent.q, guess=bent), integrator=integrator, **COARSE)
