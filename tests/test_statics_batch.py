@@ -17,6 +17,8 @@ from pcr_mpc import (
     solve_statics_batch,
 )
 from pcr_mpc.compiled import has_compiler
+from pcr_mpc.plant import elastica
+from pcr_mpc.plant.rod import sample_rod
 
 from .conftest import MODELS
 
@@ -187,11 +189,12 @@ def test_rows_that_fail_say_why_and_leave_the_others_alone(pair, centre, along):
         solve_statics(pair, p[60], q[60])
 
 
-def test_a_path_that_comes_to_a_fold_goes_on_from_the_pose_before(pair, centre):
-    """Poses beyond the fold fail; back on this side they are solved again, on the old branch."""
+@pytest.mark.parametrize("cold", [True, False])
+def test_a_path_that_comes_to_a_fold_goes_on_from_the_pose_before(pair, centre, cold):
+    """Poses beyond the fold fail, also on a path that began cold; back on this side the old branch goes on."""
     part = np.concatenate([np.linspace(0.0, 1.0, 120), np.linspace(1.0, 0.0, 120)])
     q = centre.q + part[:, None] * [-3.5, 3.5]
-    batch = solve_statics_batch(pair, np.tile(centre.p, (240, 1)), q, guess=centre, along=True)
+    batch = solve_statics_batch(pair, np.tile(centre.p, (240, 1)), q, guess=None if cold else centre, along=True)
     beyond = np.flatnonzero(~batch.solved)
     assert beyond.size
     assert 30 < beyond[0] < 119
@@ -224,16 +227,16 @@ def test_without_a_guess_the_shape_of_least_energy_is_taken(pair, centre):
 
 def test_taut_rows_are_refined_as_one_pose_is(pair):
     """Where one step a segment drifts too much for a taut rod, more are taken."""
-    p = np.array([[0.0, 0.37], [0.0, 0.38], [0.0, 0.386]])
-    q = np.tile([1.9, np.pi - 1.9], (3, 1))
+    p = np.stack([np.zeros(40), np.linspace(0.38, 0.386, 40)], axis=1)
+    q = np.tile([1.9, np.pi - 1.9], (40, 1))
     guess = solve_statics(pair, p[0], q[0], method="multiple_shooting")
     coarse = solve_statics_batch(pair, p, q, guess=guess, along=True, method="multiple_shooting", steps=1)
     batch = solve_statics_batch(pair, p, q, guess=guess, along=True, method="multiple_shooting")
-    assert coarse.drift[2] > 1e-6
+    assert coarse.drift[-1] > 1e-6
     assert batch.solved.all()
     assert (batch.drift < 1e-6).all()
-    exact = solve_statics(pair, p[2], q[2])
-    errors = [np.abs(found.force[2] - exact.force).max() for found in (coarse, batch)]
+    exact = solve_statics(pair, p[-1], q[-1])
+    errors = [np.abs(found.force[-1] - exact.force).max() for found in (coarse, batch)]
     assert errors[1] < errors[0] / 10
 
 
@@ -252,14 +255,15 @@ def test_a_robot_of_three_rods(pair):
 
 def test_wrong_arguments_of_a_batch_are_named(pair, centre):
     p, q = loop(centre, 3)
-    three = load_robot(MODELS / "three_rods.toml")
+    three_rods = inverse_statics(load_robot(MODELS / "three_rods.toml"), (0.01, 0.12), mode="LLL")
     wrong = [
         (ValueError, r"p has shape \(2,\)", (p[0], q), {}),
         (ValueError, r"q has shape \(3, 1\)", (p, q[:, :1]), {}),
         (ValueError, "p has 2 rows, q 3", (p[1:], q), {}),
         (ValueError, "expected numbers", (p, [["a", "b"]] * 3), {}),
         (TypeError, "guess is a list", (p, q), {"guess": [1.0]}),
-        (ValueError, "guess has 3 rods", (p, q), {"guess": inverse_statics(three, (0.01, 0.12), mode="LLL")}),
+        (ValueError, "guess has 3 rods", (p, q), {"guess": three_rods}),
+        (ValueError, "guess has 3 rods", (p, q), {"guess": three_rods, "method": "single_shooting"}),
         (ValueError, "method is 'newton'", (p, q), {"method": "newton"}),
     ]
     for kind, words, arguments, options in wrong:
@@ -292,3 +296,29 @@ def test_every_other_row_may_fail(pair, centre, along):
     np.testing.assert_allclose(
         batch.force[1::2], solve_statics_batch(pair, p, q, guess=centre, along=along).force[1::2], atol=1e-10
     )
+
+
+def test_poses_that_are_not_stable_are_told(pair, centre):
+    """A saddle: rods that are stable with the tip held, which motors at rest do not hold."""
+    p, q = np.array([centre.p, [0.0, 0.15]]), np.array([centre.q, [2.25, np.pi - 2.25]])
+    batch = solve_statics_batch(pair, p, q)
+    np.testing.assert_array_equal(batch.stable, [True, False])
+    assert not batch.unstable.any()
+    assert np.linalg.eigvalsh(batch.dforce_dp[1])[0] < 0 < np.linalg.eigvalsh(batch.dforce_dp[0])[0]
+
+
+@pytest.mark.parametrize("method", ["closed_form", "multiple_shooting"])
+def test_rods_beyond_their_limit_are_told_after_a_warm_start_too(pair, method):
+    """k = 0.6, load 7.2: lambda_c is 6.7. The first rung is for stable rods."""
+    nodes = elastica.nodes(np.array([np.log(2 * np.arccos(0.6)), 7.2, 1.0]), 0.0, 8)
+    p = pair.rods[0].base + pair.rods[0].length * sample_rod(nodes, 2)[:2, -1]
+    other = np.arctan2(*(p - pair.rods[1].base)[::-1]) + 0.5
+    gentle = solve_statics(pair, p, (0.5, other)).nodes[1]
+    guess = solve_statics(pair, p, (0.0, other), method=method, guess=np.stack([nodes, sample_rod(gentle, 9)[2:, :8]]))
+    tips, angles = p + np.array([[1e-6, 0.0], [0.0, 1e-6]]), np.tile(guess.q, (2, 1))
+    for tip in tips:
+        assert solve_statics(pair, tip, guess.q, method=method, guess=guess).unstable_rods == (0,)
+    for along in (True, False):
+        batch = solve_statics_batch(pair, tips, angles, method=method, guess=guess, along=along)
+        np.testing.assert_array_equal(batch.unstable, [[True, False]] * 2)
+        assert not batch.stable.any()
