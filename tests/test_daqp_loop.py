@@ -127,9 +127,9 @@ def test_the_closed_loop_is_that_of_osqp(name, monkeypatch):
     seen = []
 
     class Recorded(DAQPSolver):
-        def update(self, *arguments):
+        def update(self, *arguments, **options):
             self.given = [np.array(each) for each in arguments]  # they are overwritten
-            super().update(*arguments)
+            super().update(*arguments, **options)
 
         def solve(self, most=None, **options):
             solution = super().solve(most, **options)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pcr_mpc.plant.rod import sample_rod
 
 from pcr_mpc import (
     Equilibria,
@@ -14,7 +15,6 @@ from pcr_mpc import (
 )
 from pcr_mpc.compiled import has_compiler
 from pcr_mpc.plant import elastica
-from pcr_mpc.plant.rod import sample_rod
 
 from .conftest import MODELS
 
