@@ -37,7 +37,7 @@ def test_scenes_and_tunings_say_which(tmp_path):
         ({"inertia": "full", "integrator": "rk4"}, "plant.integrator: is rk4: inertia 'full' needs 'gauss'"),
         ({"inertia": "none", "integrator": "gauss"}, "plant.integrator: is gauss"),
         ({"inertia": "constant", "method": "single_shooting"}, "plant.inertia: is constant, which method"),
-        ({"inertia": "some"}, "plant.rods.inertia"),
+        ({"inertia": "some"}, "plant.inertia"),
     ],
 )
 def test_what_does_not_go_together_is_named(tmp_path, keys, problem):

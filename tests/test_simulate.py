@@ -215,8 +215,7 @@ def test_fallbacks_are_counted(lemniscate):
             if k == 1:
                 workspace = controller._law._workspace
                 for solver in (workspace._rates_only, *(one._solver for one in workspace._limited.values())):
-                    solver._settings["max_iter"] = 1
-                    solver.reset()
+                    solver._most = 1
             return controller.step(k, x)
 
     run = simulate(scene, scene.make_plant(), Starved())

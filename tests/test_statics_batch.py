@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from pcr_mpc.plant.rod import sample_rod
 
 from pcr_mpc import (
     Equilibria,
@@ -14,7 +13,8 @@ from pcr_mpc import (
     solve_statics_batch,
 )
 from pcr_mpc.compiled import has_compiler
-from pcr_mpc.plant import elastica
+from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.equations import sample_rod
 
 from .conftest import MODELS
 

@@ -350,7 +350,7 @@ def test_a_scene_that_was_tuned_is_tuned_from_the_default_again(tmp_path, monkey
     scene.write_text(re.sub(r"controllers/\w+\.toml", "controllers/hold_with_load.toml", scene.read_text()))
     default = load_tuning(CONTROLLERS / "default.toml")
     known = replace(default, name="hold_with_load", period=0.005, horizon=14)
-    write_tuning(known, tmp_path / "controllers/hold_with_load.toml", [])
+    write_tuning(known, tmp_path / "controllers/hold_with_load.toml", [], force=True)
     monkeypatch.chdir(tmp_path)
     searches = []
 

@@ -134,7 +134,7 @@ def test_a_file_where_the_results_should_go_is_named(files, capsys, command):
     taken = files / "taken"
     taken.write_text("mine")
     assert main([command, str(SCENES / "lemniscate.toml"), "--out", str(taken)]) == 1
-    assert capsys.readouterr().err.splitlines()[-1].startswith(f"pcr-mpc: {taken}: is a file")
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"pcr-mpc: {taken}: a file is where a folder")
     assert taken.read_text() == "mine"
 
 
