@@ -235,14 +235,14 @@ class TrackingController(Remade):
             observer.take(corrected)
         estimate, force = corrected[:-2].copy(), corrected[-2:].copy()
         linearised = time.perf_counter()
-        plan, ahead = self._decide(k, outlook, pose_limits, estimate, force, failure, linearised)
-        plan = self._within_stops(plan, ahead)
+        decided, ahead = self._decide(k, outlook, pose_limits, estimate, force, failure, linearised)
+        plan = self._within_stops(decided, ahead)
         self._u, self._plan = plan.inputs[0], plan
         self._reckoned = self._reckoned + self._scene.period * self._u
         self._sent.append(self._u)
         self._on_the_way.append(self._u)
         arriving = self._on_the_way.popleft()
-        self._look_on(outlook, plan, estimate, arriving)
+        self._look_on(outlook, plan, estimate, arriving, foreseen=plan is decided and not self._delay)
         return Decision(plan.inputs[0], plan, linearised - began, estimate, force, found.events)
 
     def _tell(self, k: int, now: np.ndarray, p: np.ndarray | None, q: np.ndarray | None) -> None:
@@ -308,8 +308,10 @@ class TrackingController(Remade):
             return self._law.decide(qp, ahead, models, window, self._u, pose_limits, began), ahead
         return self._law.solve(ahead, outlook.models.copy(), window, self._u, pose_limits), ahead
 
-    def _look_on(self, outlook: Outlook | None, plan: Plan, estimate: np.ndarray, arriving: np.ndarray) -> None:
-        """Foresee the state at the next measurement."""
+    def _look_on(
+        self, outlook: Outlook | None, plan: Plan, estimate: np.ndarray, arriving: np.ndarray, *, foreseen: bool
+    ) -> None:
+        """Foresee the state at the next measurement; the plan has ``foreseen`` it if its first rates act at once."""
         if outlook is not None and self._delay:
             self._predicts = outlook.now.copy()
             self._next = outlook.arriving.copy()
@@ -318,10 +320,10 @@ class TrackingController(Remade):
                 # A plan may know better than the models that it was asked for with.
                 better = outlook.models.copy() if plan.models is None or plan.fallback else plan.models
                 self._predicts = LinearModels.of([better] if isinstance(better, LinearModel) else better)
-            if plan.states is None or plan.fallback or self._delay:
-                self._next = self._predicts[0](estimate, arriving)
-            else:
+            if foreseen and plan.states is not None and not plan.fallback:
                 self._next = plan.states[1].copy()
+            else:
+                self._next = self._predicts[0](estimate, arriving)
         if self.observer is not None:
             self.observer.x = self._next
 
