@@ -34,6 +34,10 @@ _SMALLEST_GROWTH = 1.0 / 256.0
 _FURTHEST = 0.1  # from a fold, in units of L and rad, at which its shape is sought to be gone
 
 
+# Pull beyond which the shape of a rod takes more points than can be kept, in EI/L^2.
+_HARDEST = 1e10
+
+
 class NotConverged(Exception):
     """Newton's method failed: where it stood."""
 
@@ -279,6 +283,11 @@ class RodFollower:
         self, pose: np.ndarray, unknowns: np.ndarray, loads: np.ndarray, residual: float, iterations: int
     ) -> RodState:
         _, tangent, _, load_tangent, scalars = self._newton.outputs
+        pull = math.hypot(*loads[:2].tolist())
+        if pull > _HARDEST:
+            raise NotConverged(
+                residual, iterations, unknowns, f"it is pulled straight at {pull:.1e} EI/L^2, at most {_HARDEST:.0e}"
+            )
         return RodState(
             pose,
             unknowns,
