@@ -10,7 +10,7 @@ import casadi as ca
 from ..buffered import graph_cache
 from ..plant.motion.mass_matrix import mass_calls
 from ..plant.motion.step_graph import StepModel
-from ..plant.rods.method import warm_calls
+from ..plant.rods.method import inlined, warm_calls
 from ..plant.statics.weight import robot_weight
 from .linearise import discretisation
 
@@ -102,3 +102,9 @@ def model_graph(model: StepModel, iterations: int) -> Any:
         "model", [x, f_ext, payload, memory, vector, constant, dt],
         [record, packed, ca.vertcat(verdict, stiffness, damping**2)],
     )  # fmt: skip
+
+
+@graph_cache(maxsize=16)
+def model_list(model: StepModel, iterations: int) -> Any:
+    """`model_graph` as one list of instructions, if that is not too long: an eighth faster, and slow to compile."""
+    return inlined(model_graph(model, iterations), model.method.newton)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..buffered import BufferedFunction
-from ..compiled import fastest
+from ..compiled import fastest, has_compiler
 from ..errors import ConvergenceError, PCRError
 from ..linearisation.linear_model import LinearModels
 from ..linearisation.linearise import linearise
@@ -93,7 +93,8 @@ class Foresight:
         assert plant.step_model is not None
         assert target.step_model is not None
         self._plant, self._target_plant, self.places, self._period = plant, target, places, period
-        graph = foresight_graph(plant.step_model, target.step_model, places, condense)
+        inline = not (compiled and has_compiler())
+        graph = foresight_graph(plant.step_model, target.step_model, places, condense, inline=inline)
         self._graph = BufferedFunction(fastest(graph, compiled))
         self.inputs = dict(zip(graph.name_in(), self._graph.inputs, strict=True))
         self._outputs = dict(zip(graph.name_out(), self._graph.outputs, strict=True))

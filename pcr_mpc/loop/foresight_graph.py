@@ -8,6 +8,7 @@ of a place start from its neighbour's, and only the last of them has a way to go
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ import casadi as ca
 from ..buffered import graph_cache
 from ..control.observer import correction
 from ..linearisation.linearise import STIFFEST
-from ..linearisation.model_graph import force_graph, model_graph, sizes
+from ..linearisation.model_graph import force_graph, model_graph, model_list, sizes
 from ..plant.motion.step_graph import LARGEST_DRIFT, StepModel
 from ..plant.rods.follower import BRANCH_CHANGE
 
@@ -53,7 +54,9 @@ class Places:
 
 
 @graph_cache(maxsize=16)
-def foresight_graph(model: StepModel, target: StepModel, places: Places, condense: Any | None) -> Any:
+def foresight_graph(
+    model: StepModel, target: StepModel, places: Places, condense: Any | None, *, inline: bool = False
+) -> Any:
     """Build the graph.
 
     Parameters
@@ -63,6 +66,8 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
     places : Places
     condense : casadi.Function or None
         See `condensing`. None: no QP is wanted.
+    inline : bool
+        Make one list of instructions of each model, for CasADi's interpreter; else calls, for a compiler.
 
     Returns
     -------
@@ -99,15 +104,16 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
     given = SimpleNamespace(**inputs)
     corrected = correction(n)(given.estimate, given.measured, given.gain, given.half_step)
     x, force = corrected[:-2], corrected[-2:]
-    found = [_place(model, given, x, force, 0, last=count == 1)]
+    graph_of = model_list if inline else model_graph
+    found = [_place(graph_of, model, given, x, force, 0, last=count == 1)]
     ahead = arriving = x
     for j in range(places.delay):
         ahead = _moved(found[j][1], ahead, given.on_the_way[:, j], n)
         arriving = ahead if j == 0 else arriving
-        found.append(_place(model, given, ahead, force, j + 1, last=j + 1 == count - 1))
+        found.append(_place(graph_of, model, given, ahead, force, j + 1, last=j + 1 == count - 1))
     for j in range(places.delay + 1, count):
         there = given.path[:, j - places.delay - 1]
-        found.append(_place(model, given, there, force, j, last=j == count - 1))
+        found.append(_place(graph_of, model, given, there, force, j, last=j == count - 1))
     records, models, good, states_of = (ca.horzcat(*columns) for columns in zip(*found, strict=True))
     shift, target_record, target_good = _shifted(target, given, force, n)
     states = given.states + ca.vertcat(ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon))
@@ -127,10 +133,19 @@ def foresight_graph(model: StepModel, target: StepModel, places: Places, condens
     return ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
 
 
-def _place(model: StepModel, given: Any, x: Any, force: Any, j: int, *, last: bool) -> tuple[Any, ...]:
+def _place(
+    graph_of: Callable[[StepModel, int], Any],
+    model: StepModel,
+    given: Any,
+    x: Any,
+    force: Any,
+    j: int,
+    *,
+    last: bool,
+) -> tuple[Any, ...]:
     """Record and linear model of place j, whether its rods have followed, and x, where it is."""
     memory = given.records[: sizes(model).memory, j]
-    graph = model_graph(model, 2 if last else 1)
+    graph = graph_of(model, 2 if last else 1)
     record, packed, verdict = graph(x, force, given.payloads[j], memory, given.numbers, given.mass, given.dt)
     return record, packed, _kept(verdict, [*_VERDICT, STIFFEST, STIFFEST]), x
 
