@@ -101,7 +101,7 @@ def require_equilibrium(eq):
         if isinstance(value, np.ndarray | float):
             assert np.isfinite(value).all(), field.name
     # The rounding of the tip position counts by the slack.
-    tolerance = TOLERANCE[eq.method] + 1e-14 / min(eq.robot.slacks(eq.p))
+    tolerance = TOLERANCE[eq.method] + 1e-14 / max(min(eq.robot.slacks(eq.p)), 1e-9)
     wrong = {name: value for name, value in residuals(eq).items() if not value < tolerance}
     assert not wrong, (eq.p, eq.q, wrong)
 
