@@ -264,7 +264,7 @@ def test_every_setting_of_a_file_arrives(tmp_path):
         ("weights", "angle", "-1.0"), ("weights", "input", "0.0"), ("weights", "input", "-1.0"),
         ("solver", "tolerance", "0.0"), ("solver", "max_iterations", "1.5"), ("solver", "fallback", '"none"'),
         ("observer", "tip_noise", "0.0"), ("observer", "force_noise", "-0.1"), ("observer", "force_walk", "0.0"),
-        ("observer", "on", "1"), ("model", "method", '"magic"'), ("model", "scheme", '"rk2"'),
+        ("observer", "on", "1"), ("model", "method", '"magic"'), ("model", "method", '"single_shooting"'), ("model", "scheme", '"rk2"'),
         ("model", "inertia", '"full"'), ("model", "linearise", '"everywhere"'), ("model", "payload", "0"),
         ("", "period", "-0.01"), ("", "law", '"mpc"'), ("", "horizon", "7.0"), ("weights", "positoin", "1.0"),
     ],

@@ -18,6 +18,8 @@ from .observer import ObserverTuning
 
 SCHEMES = ("rk4", "rk8")
 LAWS = ("linear_mpc", "nonlinear_mpc", "lqr", "pd", "feed_forward")
+# Single shooting is no graph, and keeps to no branch.
+PREDICTING = tuple(method for method in METHODS if method != "single_shooting")
 LINEARISE = ("here", "along_plan")
 INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
@@ -62,7 +64,7 @@ class Model:
         for name in ("segments", "steps"):
             object.__setattr__(self, name, checked_integer(name, getattr(self, name)))
         for name, choices in (
-            ("method", METHODS),
+            ("method", PREDICTING),
             ("scheme", SCHEMES),
             ("inertia", INERTIAS),
             ("linearise", LINEARISE),
@@ -294,7 +296,7 @@ def load_tuning(path: str | Path) -> Tuning:
             fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),
             solver=solver.text("name", SOLVERS[0], choices=SOLVERS),
             model=Model(
-                method=model.text("method", Model.method, choices=METHODS),
+                method=model.text("method", Model.method, choices=PREDICTING),
                 segments=model.integer("segments", Model.segments),
                 steps=model.integer("steps", Model.steps),
                 scheme=model.text("scheme", Model.scheme, choices=SCHEMES),

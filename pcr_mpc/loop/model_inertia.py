@@ -30,12 +30,10 @@ def by_model_inertia(
     Returns
     -------
     dict
-        Inertia of the model -> rms_mm, rms_after_1s_mm, max_mm and failures; just that of the run where the tuning's
-        method knows no other.
+        Inertia of the model -> rms_mm, rms_after_1s_mm, max_mm and failures.
     """
     found = {tuning.model.inertia: run}
-    known = INERTIAS if tuning.model.method != "single_shooting" else ()
-    others = [inertia for inertia in known if inertia not in found]
+    others = [inertia for inertia in INERTIAS if inertia not in found]
     for inertia in others:
         other = replace(tuning, model=replace(tuning.model, inertia=inertia))
         try:

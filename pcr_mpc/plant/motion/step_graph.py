@@ -6,6 +6,7 @@ the same arithmetic, without Python in between.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,7 +70,7 @@ class StepModel:
         return np.concatenate([start, force, *(matrix.ravel(order="F") for matrix in kept)])
 
 
-class Motion:
+class Motion(ABC):
     """Rods and mass on their way through a step, as expressions; a subclass says how the rods follow.
 
     Parameters
@@ -99,9 +100,9 @@ class Motion:
         """First arguments of the graphs of `integrators`."""
         return [*self.mass, self._push - self.force, self._rates, ca.vertcat(self.numbers.drag, self.model.dt)]
 
+    @abstractmethod
     def follow(self, p: Any, q: Any) -> tuple[Any, Any]:
         """Let the rods follow to (p, q), and return their unknowns (u, n) and the force that holds the tip."""
-        raise NotImplementedError
 
     def move(self, p: Any, q: Any) -> None:
         """Let all follow to (p, q)."""
