@@ -17,7 +17,7 @@ from pcr_mpc import (
     solve_statics,
 )
 from pcr_mpc.loop.controllers import HoldMotors
-from pcr_mpc.loop.feed_forward import feed_forward
+from pcr_mpc.loop.feed_forward import _momentum, feed_forward
 from pcr_mpc.loop.settings import Payload
 from pcr_mpc.loop.target import MotorTarget
 from pcr_mpc.loop.tracking import TrackingController, motor_limits
@@ -227,3 +227,22 @@ def test_a_large_shift_is_taken_in_steps_and_one_out_of_reach_not_at_all(pair, c
     assert target.shift(np.array([0.0, 0.9]), centre.q, centre.force).tolist() == held.tolist()
     target.start(centre)
     assert target.shift(centre.p, centre.q, centre.force) == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+def test_the_rods_push_the_tip_by_the_slope_of_their_kinetic_energy(pair, centre):
+    """dT/dp at given velocities, against differences of T = w' M w / 2; and the momentum is dT/dv."""
+    heavy = replace(pair, rods=tuple(replace(rod, line_density=10 * rod.line_density) for rod in pair.rods))
+    plant, v, rates = Plant(heavy, inertia="condensed"), np.array([0.3, -0.2]), np.array([2.0, 1.0])
+    plant.reset(at_rest(centre), centre)
+
+    def energy(p, v):
+        w = np.concatenate([v, rates])
+        return w @ plant.mass(p, centre.q)[0] @ w / 2
+
+    momentum, push, _ = _momentum(plant, np.zeros(1), centre.p[None], v[None], centre.q[None], rates[None])
+    by_p, by_v = np.empty(2), np.empty(2)
+    for axis, h in enumerate(1e-5 * np.eye(2)):
+        by_p[axis] = (energy(centre.p + h, v) - energy(centre.p - h, v)) / 2e-5
+        by_v[axis] = (energy(centre.p, v + h) - energy(centre.p, v - h)) / 2e-5
+    assert push[0] == pytest.approx(by_p, rel=1e-5)
+    assert momentum[0] == pytest.approx(by_v, rel=1e-7)
