@@ -14,7 +14,8 @@ MODELS = ROOT / "models"
 CONTROLLERS = ROOT / "controllers"
 DATA = Path(__file__).parent / "data"
 # Nothing is compiled, by subprocesses neither, but in tests that ask for the compiler.
-COMPILER = os.environ.get("CC", "cc")
+# Workers of a run on all cores inherit what is set here, and look for the compiler in the other variable.
+COMPILER = os.environ.setdefault("COMPILER_OF_TESTS", os.environ.get("CC", "cc"))
 os.environ["CC"] = ""
 
 

@@ -12,7 +12,6 @@ from pcr_mpc import (
     solve_statics,
     solve_statics_batch,
 )
-from pcr_mpc.compiled import has_compiler
 from pcr_mpc.plant.rods import elastica
 from pcr_mpc.plant.rods.equations import sample_rod
 
@@ -186,9 +185,7 @@ def test_wrong_arguments_of_a_batch_are_named(pair, centre):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not has_compiler(), reason="no C compiler")
-def test_machine_code_gives_the_same_bits(pair, centre, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_machine_code_gives_the_same_bits(pair, centre, compiler):
     p, q = loop(centre, 20)
     for along in (True, False):
         one, two = (solve_statics_batch(pair, p, q, guess=centre, along=along, compiled=c) for c in (False, True))
