@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pcr_mpc import Equilibrium, Robot, inverse_statics, load_robot, solve_statics
+from pcr_mpc import Equilibrium, LinearModel, Plant, Robot, inverse_statics, linearise, load_robot, solve_statics
 
 ROOT = Path(__file__).parent.parent
 MODELS = ROOT / "models"
@@ -49,6 +49,20 @@ def rfrfr() -> Robot:
 def centre(pair: Robot) -> Equilibrium:
     """The default robot in balance at (0, 0.25), rods bowed outward."""
     return inverse_statics(pair, (0.0, 0.25), mode="LR")
+
+
+@pytest.fixture(scope="session")
+def target(centre: Equilibrium) -> np.ndarray:
+    """State at rest in the centre."""
+    return np.concatenate([centre.p, np.zeros(2), centre.q])
+
+
+@pytest.fixture(scope="session")
+def model(pair: Robot, centre: Equilibrium, target: np.ndarray) -> LinearModel:
+    """About the centre, for a period of 10 ms."""
+    plant = Plant(pair)
+    plant.reset(target, centre)
+    return linearise(plant, target, np.zeros(2), 0.01)
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,7 @@ import scipy.sparse as sp
 from pcr_mpc import (
     LinearMPC,
     ModelError,
-    Plant,
     Reference,
-    linearise,
     load_scene,
     load_tuning,
     make_controller,
@@ -32,18 +30,6 @@ from .conftest import CONTROLLERS, MODELS
 
 TUNING = replace(load_tuning(CONTROLLERS / "default.toml"), horizon=6, solver="daqp")
 DT = 0.01
-
-
-@pytest.fixture(scope="module")
-def target(centre):
-    return np.concatenate([centre.p, [0, 0], centre.q])
-
-
-@pytest.fixture(scope="module")
-def model(pair, centre, target):
-    plant = Plant(pair)
-    plant.reset(target, centre)
-    return linearise(plant, target, [0.0, 0.0], DT)
 
 
 def soft_problem(size, hard, soft):

@@ -8,9 +8,7 @@ import pytest
 from pcr_mpc import (
     InfeasibleError,
     LinearMPC,
-    Plant,
     Reference,
-    linearise,
     load_scene,
     load_tuning,
     make_controller,
@@ -31,18 +29,6 @@ DT, RATE, CHANGE = 0.01, 6.0, 1.0
 def tuning():
     # Steps of centimetres under narrow limits take OSQP longer than the default allows.
     return replace(load_tuning(CONTROLLERS / "default.toml"), max_iterations=4000)
-
-
-@pytest.fixture(scope="module")
-def target(centre):
-    return np.concatenate([centre.p, [0.0, 0.0], centre.q])
-
-
-@pytest.fixture(scope="module")
-def model(pair, centre, target):
-    plant = Plant(pair)
-    plant.reset(target, centre)
-    return linearise(plant, target, [0.0, 0.0], DT)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from pcr_mpc import InfeasibleError, LinearMPC, Plant, Reference, linearise, load_tuning
+from pcr_mpc import InfeasibleError, LinearMPC, Reference, load_tuning
 from pcr_mpc.control.tuning import Limits
 
 from .conftest import CONTROLLERS
@@ -14,18 +14,6 @@ from .conftest import CONTROLLERS
 def tuning():
     # Steps of centimetres under narrow limits take OSQP longer than the default allows.
     return replace(load_tuning(CONTROLLERS / "default.toml"), max_iterations=4000)
-
-
-@pytest.fixture(scope="module")
-def target(centre):
-    return np.concatenate([centre.p, [0, 0], centre.q])
-
-
-@pytest.fixture(scope="module")
-def model(pair, centre, target):
-    plant = Plant(pair)
-    plant.reset(target, centre)
-    return linearise(plant, target, (0.0, 0.0), 0.01)
 
 
 @pytest.fixture

@@ -39,11 +39,6 @@ def tuning():
 
 
 @pytest.fixture(scope="module")
-def target(centre):
-    return np.concatenate([centre.p, [0.0, 0.0], centre.q])
-
-
-@pytest.fixture(scope="module")
 def plant(pair):
     return Plant(pair, integrator="rk4", dt=1e-4)
 

@@ -26,18 +26,6 @@ def tuning() -> Tuning:
 
 
 @pytest.fixture(scope="module")
-def target(centre):
-    return np.concatenate([centre.p, NONE, centre.q])
-
-
-@pytest.fixture(scope="module")
-def model(pair, centre, target):
-    plant = Plant(pair)
-    plant.reset(target, centre)
-    return linearise(plant, target, NONE, DT)
-
-
-@pytest.fixture(scope="module")
 def slow(pair, centre, target):
     """Model of a robot whose tip is ten times as heavy."""
     plant = Plant(replace(pair, tip_mass=10 * pair.tip_mass))

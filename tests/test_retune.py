@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import LinearMPC, Plant, Reference, linearise, load_scene, load_tuning, make_controller
+from pcr_mpc import LinearMPC, Reference, load_scene, load_tuning, make_controller
 from pcr_mpc.control.laws import LQR, PD, FeedForward
 from pcr_mpc.control.observer import ObserverTuning
 from pcr_mpc.control.tuning import Limits
-from pcr_mpc.errors import ReadOnlyError
+from pcr_mpc.errors import PCRError, ReadOnlyError
+from pcr_mpc.loop.foresight import Foresight
 from pcr_mpc.loop.tracking import motor_limits
 
 from .conftest import CONTROLLERS, MODELS
@@ -24,18 +25,6 @@ CHANGES = {
     "shorter": {"horizon": 3},
     "solver": {"tolerance": 1e-7, "max_iterations": 3999},
 }
-
-
-@pytest.fixture(scope="module")
-def target(centre):
-    return np.concatenate([centre.p, [0, 0], centre.q])
-
-
-@pytest.fixture(scope="module")
-def model(pair, centre, target):
-    plant = Plant(pair)
-    plant.reset(target, centre)
-    return linearise(plant, target, (0.0, 0.0), 0.01)
 
 
 def held(target, tuning, off=0.0):
@@ -237,6 +226,28 @@ def test_a_retuning_that_is_refused_changes_nothing(scene):
         controller.retune(replace(BASE, period=0.02))
     assert controller.tuning is BASE
     np.testing.assert_array_equal(controller.step(4, x).u, other.step(4, x).u)
+
+
+@pytest.mark.parametrize("failing", ["pose", "reset", "target_from"])
+@pytest.mark.parametrize("law", ["linear_mpc", "lqr"])
+@pytest.mark.parametrize("stopped_by", [PCRError, KeyboardInterrupt])
+def test_a_retuning_that_fails_half_way_changes_nothing(scene, monkeypatch, failing, law, stopped_by):
+    tuning = replace(BASE, law=law)
+    controller, x = begun(scene, tuning, 4)
+    other, _ = begun(scene, tuning, 4)
+
+    def fail(*_):
+        raise stopped_by("half way")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Foresight, failing, fail)
+        with pytest.raises(stopped_by, match="half way"):
+            controller.retune(replace(tuning, horizon=9, input_weight=10.0, velocity_weight=50.0))
+    assert controller.tuning is tuning
+    for k in (4, 5):
+        found, expected = controller.step(k, x), other.step(k, x)
+        np.testing.assert_array_equal(found.plan.inputs, expected.plan.inputs)
+        assert (found.plan.status, found.plan.fallback) == (expected.plan.status, expected.plan.fallback)
 
 
 def test_a_controller_is_retuned_before_its_start_and_copied_as_it_is_tuned_now(scene):

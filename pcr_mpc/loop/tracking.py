@@ -138,12 +138,14 @@ class TrackingController(Remade):
                 f"{tuning.name} is for a control period of {tuning.period} s, the controller runs at {period} s; "
                 "make a new one for scene.tuned(tuning)"
             )
-        before = self.__dict__.copy()
+        # A law is retuned in place.
+        before = [(part, part.__dict__.copy()) for part in (self, self._law) if part is not None]
         try:
             self._retune(tuning)
         except BaseException:
-            self.__dict__.clear()
-            self.__dict__.update(before)
+            for part, attributes in before:
+                part.__dict__.clear()
+                part.__dict__.update(attributes)
             raise
         self._now_made_of(tuning=tuning, reference=None)
 
