@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: track test test-slow lint figures charts benchmarks mutants clean
+.PHONY: track test test-slow lint docs figures charts benchmarks mutants clean
 
 track: $(READY)  ## follow the figure of eight in closed loop; pictures and table in results/lemniscate
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml
@@ -19,6 +19,10 @@ lint: $(READY)  ## style, types, layers
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(READY)  ## the pages, in docs/_build/html; warnings are errors, and figures in the text must be those of the records
+	$(BIN)/python -m experiments.text_figures
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 
 figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/paper_figures.py --out docs
@@ -58,8 +62,8 @@ mutants: $(READY)  ## which of N changes of the code the tests notice, in result
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers,cluster,tune,mujoco]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,docs,peers,cluster,tune,mujoco]"
 	touch $(READY)
 
 clean:
-	rm -rf .venv results
+	rm -rf .venv results docs/_build docs/generated

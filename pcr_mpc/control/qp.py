@@ -52,7 +52,7 @@ class QuadraticProgram:
     l, u : ndarray, shape (3 N n,)
         Bounds.
     sizes : (float, float, float), optional
-        |P|, |q|, and 1 if all entries are finite and no bounds cross, as the graph that made them has found.
+        ``|P|``, ``|q|``, and 1 if all entries are finite and no bounds cross, as the graph that made them has found.
     """
 
     P: np.ndarray
@@ -74,7 +74,7 @@ def build_qp(
 ) -> QuadraticProgram:
     """Assemble the QP of one control step.
 
-    Minimises 1/2 sum_k |x_k - xr_k|^2_Q + 1/2 |x_N - xr_N|^2_T + 1/2 sum_k |u_k - ur_k|^2_R over the affine
+    Minimises ``1/2 sum_k |x_k - xr_k|^2_Q + 1/2 |x_N - xr_N|^2_T + 1/2 sum_k |u_k - ur_k|^2_R`` over the affine
     model, with the states eliminated.
 
     Parameters
@@ -86,6 +86,8 @@ def build_qp(
     reference : Reference
     u_previous : ndarray, shape (n,)
         Input of the last period, from which the change of rate counts [rad/s].
+    tuning, limits : Tuning, Limits
+        Horizon and weights; what the motors can do.
     terminal_weight : ndarray, shape (4 + n, 4 + n)
         T, for instance the cost-to-go of the LQR.
     """

@@ -150,9 +150,9 @@ class Limits(Frozen):
     Attributes
     ----------
     rate : float
-        Greatest |u| [rad/s].
+        Greatest ``|u|`` [rad/s].
     rate_change : float
-        Greatest |u_k - u_{k-1}| between control periods [rad/s].
+        Greatest ``|u_k - u_{k-1}|`` between control periods [rad/s].
     angle_lower, angle_upper : ndarray, shape (n,)
         Least and greatest motor angles [rad].
     """

@@ -223,7 +223,7 @@ class Robot(Frozen):
         return np.asarray(np.minimum(np.maximum(rate, -limit), limit))
 
     def slacks(self, p: np.ndarray) -> list[float]:
-        """1 - |p - base| / length of every rod: 0 where it is straight, negative out of reach."""
+        """``1 - |p - base| / length`` of every rod: 0 where it is straight, negative out of reach."""
         x, y = map(float, p)
         return [1.0 - math.hypot(x - rod.base[0], y - rod.base[1]) / rod.length for rod in self.rods]
 

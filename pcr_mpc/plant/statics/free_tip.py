@@ -106,7 +106,7 @@ def inverse_statics(
     Raises
     ------
     UnreachableError
-        If |p - base_i| >= L_i for some rod i, or the branch of the guess needs a motor beyond its stop.
+        If ``|p - base_i| >= L_i`` for some rod i, or the branch of the guess needs a motor beyond its stop.
     UnstableError
         The branch of the guess is not stable at p.
     ConvergenceError

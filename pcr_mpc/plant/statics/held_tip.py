@@ -75,7 +75,7 @@ def solve_statics(
     Raises
     ------
     UnreachableError
-        If |p - base_i| >= L_i for some rod i.
+        If ``|p - base_i| >= L_i`` for some rod i.
     ConvergenceError
         If the iteration did not reach the tolerance; carries the residual and the last iterate.
     ValueError

@@ -1,0 +1,65 @@
+"""What the README and the pages say of the shipped scenes: each run once with its own controller, into docs/records.
+
+``python -m experiments.scene_figures`` writes docs/records/scenes.json; ``python -m experiments.text_figures --write``
+then puts the figures into the text. Times are CPU times of the controller's thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from pcr_mpc import SimulationError, load_scene, make_controller, simulate
+from pcr_mpc.study.machine import machine, versions
+from pcr_mpc.study.provenance import commit
+
+ROOT = Path(__file__).parent.parent
+SCENES = ROOT / "models" / "scenes"
+_KEPT = ("controller", "plant", "rms_mm", "rms_after_1s_mm", "max_mm", "final_error_mm", "limit_violations", "failures")
+
+
+def measure(path: Path) -> dict[str, Any]:
+    """Figures of one scene."""
+    scene = load_scene(path)
+    try:
+        run = simulate(scene, scene.make_plant(), make_controller(scene))
+    except SimulationError as error:
+        run = error.run
+    summary = run.summary()
+    return {name: summary[name] for name in _KEPT} | {
+        "verdict": run.verdict(),
+        "control_cpu_us": summary["control_cpu_us"],
+        "plant_step_us": summary["plant_step_us"],
+        "run_hash": summary["run_hash"],
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", nargs="*", help="names, such as lemniscate (default: all)")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "records" / "scenes.json")
+    options = parser.parse_args(arguments)
+    names = options.scenes or sorted(path.stem for path in SCENES.glob("*.toml"))
+    record: dict[str, Any] = {}
+    if options.scenes and options.out.exists():
+        record = json.loads(options.out.read_text(encoding="utf-8"))
+    for name in tqdm(names, unit="scene"):
+        record[name] = measure(SCENES / f"{name}.toml")
+    about = machine()
+    record["measured"] = {
+        "processor": about["processor"], "cores": about["cores"], "load": about["load"], "versions": versions(),
+        "commit": commit(),
+    }  # fmt: skip
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(record, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    print(f"written to {options.out}")
+
+
+if __name__ == "__main__":
+    main()
