@@ -7,12 +7,14 @@ likely as any other to be drawn. Survivors are printed with their diffs, and wri
 mutants.sqlite, which Cosmic Ray's own reports read (``cr-report``, ``cr-html``).
 
 Run as ``make mutants`` or ``python -m experiments.mutants --count 20 --tests tests/test_mpc.py``; 200 take some hours.
+``--resume`` goes on where an earlier run into the same folder was stopped, and raises its number if asked for more.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import multiprocessing
 import os
 import random
 import shlex
@@ -21,19 +23,24 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections import Counter, defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from cosmic_ray.commands.init import init
 from cosmic_ray.mutating import mutate_and_test
 from cosmic_ray.work_db import WorkDB, use_db
-from cosmic_ray.work_item import MutationSpec, WorkItem
+from cosmic_ray.work_item import MutationSpec, TestOutcome, WorkItem, WorkResult
 from coverage import CoverageData
+from scipy.stats import binomtest
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("control", "loop", "study", "linearisation")
 PYTEST = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-# Beyond a few times what the tests take, a mutant is in an endless loop.
+# Beyond a few times what the tests take, a mutant is in an endless loop. What counts is the time of the processor,
+# which a busy machine does not lengthen; one that sleeps for ever is ended by the clock.
 LEAST_TIMEOUT, TIMEOUT_FACTOR = 60.0, 5.0  # s, of the time that the tests took
+CLOCK_FACTOR = 10.0
 
 
 Touched = dict[int, set[str]]  # tests by the lines of a file; all that touch the file under 0
@@ -49,12 +56,16 @@ def copied(to: Path) -> None:
             shutil.copy(ROOT / name, to / name)
 
 
-def measured(arguments: list[str]) -> tuple[dict[str, float], dict[str, Touched]]:
-    """Seconds of every test that passes, and the tests of every source file; run in the copy."""
+def measure(arguments: list[str]) -> None:
+    """Run the tests in the copy, under coverage, and leave times and lines there."""
     cover = ["--cov=pcr_mpc", "--cov-context=test", "--cov-report=", "--junitxml=times.xml"]
     done = subprocess.run([*PYTEST, *cover, *arguments], check=False)
     if done.returncode not in (0, 1):
         raise SystemExit(f"the tests did not run: pytest ended with {done.returncode}")
+
+
+def measured() -> tuple[dict[str, float], dict[str, Touched]]:
+    """Seconds of every test that passed, and the tests of every source file."""
     seconds, of_module = {}, defaultdict(set)
     for case in ElementTree.parse("times.xml").iter("testcase"):
         if not len(case):  # else it failed or was skipped
@@ -95,18 +106,84 @@ def sample(database: WorkDB, count: int, seed: int) -> list[WorkItem]:
     return [rng.choice(sorted(places[place], key=lambda item: repr(item.mutations[0]))) for place in chosen]
 
 
+def statement(change: MutationSpec) -> range:
+    """Lines of the statement that a mutant changes; of one with a body, those of its head."""
+    line = change.start_pos[0]
+    found = range(line, line + 1)
+    for node in ast.walk(ast.parse(change.module_path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.stmt):
+            inner = [child.lineno for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)]
+            end = min(inner) if inner else (node.end_lineno or node.lineno) + 1
+            if node.lineno <= line < end:
+                found = range(node.lineno, end)
+    return found
+
+
 def ordered(change: MutationSpec, touched: Touched, seconds: dict[str, float]) -> list[str]:
-    """Tests for a mutant: those of its lines first, each module's together, quick ones first."""
-    near = touched.get(change.start_pos[0], set())
-    totals: Counter[str] = Counter()
+    """Tests for a mutant: those of its statement first, each module's together, quick ones first."""
+    near = set[str]().union(*(touched.get(line, set()) for line in statement(change)))
+    totals: Counter[tuple[bool, str]] = Counter()
     for name in touched.get(0, set()):
-        totals[name.partition("::")[0]] += seconds[name]
+        totals[name in near, name.partition("::")[0]] += seconds[name]
 
     def rank(name: str) -> tuple[bool, float, str, float]:
         module = name.partition("::")[0]
-        return name not in near, totals[module], module, seconds[name]
+        return name not in near, totals[name in near, module], module, seconds[name]
 
     return sorted(touched.get(0, set()), key=rank)
+
+
+def enter(trees: multiprocessing.Queue[Path]) -> None:
+    """Give a worker its own tree."""
+    os.chdir(trees.get())
+    os.environ["PYTHONPATH"] = os.getcwd()
+
+
+def judge(change: MutationSpec, tests: list[str], limit: float) -> WorkResult:
+    """Change the worker's tree and run the tests there, up to the first that fails."""
+    # Where no test touches the file, pytest has nothing to do, and that is no death.
+    command = [*PYTEST, "-x", *tests] if tests else [sys.executable, "-c", ""]
+    bounded = ["sh", "-c", 'ulimit -t "$0" && exec "$@"', f"{limit:.0f}", *command]
+    return mutate_and_test([change], shlex.join(bounded), CLOCK_FACTOR * limit)
+
+
+def outcome(result: WorkResult) -> str:
+    """How a mutant ended, in a word."""
+    if result.test_outcome is None:
+        return "not made"
+    # A process that ran into a limit says nothing at its end.
+    late = result.test_outcome is TestOutcome.KILLED and " in " not in (result.output or "")[-40:]
+    return "timeout" if late else result.test_outcome.value
+
+
+def judged(
+    items: list[WorkItem], tests: dict[str, list[str]], limits: dict[str, float], trees: list[Path]
+) -> Iterator[tuple[WorkItem, WorkResult]]:
+    """Results as they come."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    for tree in trees:
+        queue.put(tree)
+    with ProcessPoolExecutor(len(trees), mp_context=context, initializer=enter, initargs=(queue,)) as pool:
+        submitted = {
+            pool.submit(judge, item.mutations[0], tests[item.job_id], limits[item.job_id]): item for item in items
+        }
+        for future in as_completed(submitted):
+            yield submitted[future], future.result()
+
+
+def report(chosen: list[WorkItem], results: dict[str, WorkResult], out: Path) -> None:
+    """Print and write survivors, and the share that was noticed."""
+    survivors = [r for item in chosen if (r := results[item.job_id]).test_outcome is TestOutcome.SURVIVED]
+    diffs = "\n".join(result.diff or "" for result in survivors)
+    (out / "survivors.diff").write_text(diffs + "\n", encoding="utf-8")
+    print(diffs)
+    count = len(chosen)
+    low, high = binomtest(count - len(survivors), count).proportion_ci(method="wilson")
+    print(
+        f"{1 - len(survivors) / count:.1%} of {count} noticed (95 % of such samples: {low:.0%} to {high:.0%}): "
+        f"{dict(Counter(outcome(results[item.job_id]) for item in chosen))}"
+    )
 
 
 def main() -> None:
@@ -115,34 +192,42 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200, help="mutants")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tests", nargs="*", default=[], help="pytest's arguments; default: the default tests")
+    parser.add_argument("--jobs", type=int, default=1, help="mutants judged at a time, each in a tree of its own")
+    parser.add_argument("--resume", action="store_true", help="go on with the run whose results are in --out")
     parser.add_argument("--out", type=Path, default=Path("results/mutants"))
     arguments = parser.parse_args()
-    out = arguments.out.resolve()
-    copied(out / "tree")
-    os.chdir(out / "tree")
+    out, resume = arguments.out.resolve(), arguments.resume
+    tree = out / "tree"
+    if not resume:
+        copied(tree)
+    os.chdir(tree)
     os.environ["PYTHONPATH"] = os.getcwd()
-    seconds, touched = measured(arguments.tests)
-    counts, survivors = Counter(), []
+    if not resume:
+        measure(arguments.tests)
+    seconds, touched = measured()
     with use_db(str(out / "mutants.sqlite"), mode=WorkDB.Mode.create) as database:
-        init(sorted(path for name in PACKAGES for path in Path("pcr_mpc", name).glob("*.py")), database, {})
-        for number, item in enumerate(sample(database, arguments.count, arguments.seed), 1):
+        if not (resume and database.num_work_items):
+            init(sorted(path for name in PACKAGES for path in Path("pcr_mpc", name).rglob("*.py")), database, {})
+        chosen = sample(database, arguments.count, arguments.seed)
+        results = dict(database.results)
+        tests, limits = {}, {}
+        for item in chosen:
             change = item.mutations[0]
-            tests = ordered(change, touched[change.module_path.as_posix()], seconds)
-            timeout = LEAST_TIMEOUT + TIMEOUT_FACTOR * sum(seconds[name] for name in tests)
-            # Where no test touches the file, pytest has nothing to do, and that is no death.
-            command = shlex.join([*PYTEST, "-x", *tests]) if tests else shlex.join([sys.executable, "-c", ""])
-            result = mutate_and_test([change], command, timeout)
+            tests[item.job_id] = ordered(change, touched[change.module_path.as_posix()], seconds)
+            limits[item.job_id] = LEAST_TIMEOUT + TIMEOUT_FACTOR * sum(seconds[name] for name in tests[item.job_id])
+        left = [item for item in chosen if item.job_id not in results]
+        trees = [out / f"tree-{number}" for number in range(arguments.jobs)]
+        for copy in trees:  # anew: a run that was killed leaves a mutant in them
+            shutil.rmtree(copy, ignore_errors=True)
+            shutil.copytree(tree, copy)
+        for item, result in judged(left, tests, limits, trees):
             database.set_result(item.job_id, result)
-            outcome = "not made" if result.test_outcome is None else result.test_outcome.value
-            outcome = "timeout" if result.output == "timeout" else outcome
-            counts[outcome] += 1
-            if outcome == "survived":
-                survivors.append(result.diff or "")
-            where = f"{change.module_path}:{change.start_pos[0]} {change.operator_name.removeprefix('core/')}"
-            print(f"{number:4d} {outcome:9s} {where} ({len(tests)} tests)", flush=True)
-    (out / "survivors.diff").write_text("\n".join(survivors) + "\n", encoding="utf-8")
-    print("\n".join(survivors))
-    print(f"{100 - 100 * counts['survived'] / counts.total():.0f} % of {counts.total()} noticed: {dict(counts)}")
+            results[item.job_id] = result
+            change = item.mutations[0]
+            place = f"{chosen.index(item) + 1:4d} {outcome(result):9s} {change.module_path}:{change.start_pos[0]}"
+            operator = change.operator_name.removeprefix("core/")
+            print(place, operator, f"({len(tests[item.job_id])} tests)", flush=True)
+    report(chosen, results, out)
 
 
 if __name__ == "__main__":
