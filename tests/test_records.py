@@ -212,7 +212,7 @@ def test_misses_count_against_the_period_without_a_deadline():
 
 @pytest.mark.parametrize(
     ("deadline", "cost", "misses"),
-    [(np.inf, 0.0099, 0), (np.inf, 0.011, 6), (0.02, 0.011, 6), (0.002, 0.003, 6), (0.002, 0.001, 0)],
+    [(np.inf, 0.0099, 0), (np.inf, 0.011, 6), (0.01, 0.011, 6), (0.002, 0.003, 6), (0.002, 0.001, 0)],
 )
 def test_misses_count_against_deadline_and_period(deadline, cost, misses):
     scene = replace(load_scene(SCENES / "hold_with_load.toml"), duration=0.06, deadline=deadline)

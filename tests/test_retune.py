@@ -76,6 +76,31 @@ def test_tunings_are_read_only(pair):
             law.tuning = replace(TUNING, input_weight=1.0)
 
 
+@pytest.mark.parametrize("law", [LQR, FeedForward, PD])
+@pytest.mark.parametrize("stopped_by", [PCRError, KeyboardInterrupt])
+def test_a_law_whose_retuning_fails_decides_as_before(pair, target, model, law, stopped_by, monkeypatch):
+    more = [lambda p, q, force: q + 0.1 * p] if law is PD else []
+    one, other = (law(replace(TUNING, pd=(0.3, 0.02)), motor_limits(pair, 0.01), *more) for _ in range(2))
+    for each in (one, other):
+        each.prepare(model)
+    prepare = law.prepare
+
+    def half(self, model, combinations=()):
+        prepare(self, replace(model, dt=0.5), combinations)
+        raise stopped_by("half way")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(law, "prepare", half)
+        with pytest.raises(stopped_by, match="half way"):
+            one.retune(replace(TUNING, pd=(0.9, 0.2), input_weight=5.0))
+    assert one.tuning == other.tuning
+    reference = replace(held(target, TUNING, off=0.01), forces=np.zeros((TUNING.horizon, 2)))
+    arguments = near(target), model, reference, np.zeros(2)
+    np.testing.assert_array_equal(one.solve(*arguments).inputs, other.solve(*arguments).inputs)
+    one.retune(tuning := replace(TUNING, pd=(0.9, 0.2), input_weight=5.0))
+    assert one.tuning is tuning
+
+
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
 def test_copies_of_an_mpc_start_afresh_with_the_tuning_of_now(pair, target, model, copied):
     mpc = LinearMPC(TUNING, motor_limits(pair, 0.01))

@@ -43,6 +43,8 @@ def scene():
         ({"delay": -1}, "delay is -1, expected a whole number"),
         ({"delay": 1.5}, "delay is 1.5"),
         ({"deadline": -1.0}, "deadline: is -1"),
+        ({"deadline": 0.02}, r"deadline is 0\.02 s, longer than the control period 0\.01 s"),
+        ({"deadline": math.nextafter(0.01, 1.0)}, r"deadline is 0\.010+2 s, longer"),
         ({"late": "never"}, "late is 'never', expected one of hold, shifted_plan"),
         ({"force": (1.0,)}, r"force has shape \(1,\), expected \(2,\)"),
         ({"start_velocity": (math.nan, 0.0)}, "start_velocity is not finite"),
@@ -55,6 +57,18 @@ def scene():
 def test_a_scene_from_python_is_checked_by_name(scene, changed, message):
     with pytest.raises(ModelError, match=message):
         replace(scene, **changed)
+
+
+def test_a_deadline_is_at_most_the_period_whatever_that_is(scene):
+    late = replace(scene, deadline=0.01)
+    assert (late.deadline, replace(scene, deadline=math.inf).deadline) == (0.01, math.inf)
+    quick = replace(scene.tuning, period=0.005)
+    assert scene.tuned(quick).period == 0.005
+    with pytest.raises(ModelError, match=r"deadline is 0\.01 s, longer than the control period 0\.005 s") as caught:
+        late.tuned(quick)
+    assert caught.value.key == "deadline"
+    slow = replace(scene.tuning, period=0.02)
+    assert replace(scene.tuned(slow), deadline=0.02).deadline == 0.02
 
 
 def test_what_means_the_same_is_taken(scene):

@@ -62,9 +62,11 @@ class _OneStep(ABC):
 
     def retune(self, tuning: Tuning) -> None:
         """See `Law`."""
-        self.__dict__["tuning"] = tuning
-        if self._model is not None:
-            self.prepare(self._model)
+        new = object.__new__(type(self))
+        new.__dict__.update(self.__dict__, tuning=tuning)
+        if new._model is not None:
+            new.prepare(new._model)
+        self.__dict__.update(new.__dict__)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle and copy as what it was made of; the copy starts afresh."""

@@ -61,8 +61,9 @@ class Scene:
     delay : int
         Control periods that pass before a command reaches the motors.
     deadline : float
-        Time after the start of a period [s] up to which a decision still counts as taken at its start. A later one
-        reaches the motors as late as it is. Infinite: lateness is not simulated.
+        Time after the start of a period [s] up to which a decision still counts as taken at its start, at most the
+        period. A later one reaches the motors as late as it is, but no later than at the end of its period. Infinite:
+        lateness is not simulated.
     late : {"hold", "shifted_plan"}
         What the motors do until a late decision arrives: go on as before, or as the last plan foresaw.
     pose_limits : PoseLimits
@@ -118,6 +119,12 @@ class Scene:
             raise ModelError(
                 f"period is {self.period} s, not a multiple of the plant's step {self.plant.dt} s", key="period"
             )
+        if self.period < self.deadline < math.inf:
+            raise ModelError(
+                f"deadline is {self.deadline} s, longer than the control period {self.period} s, at whose end the next "
+                "decision is due; take at most the period, or a delay of whole periods for a controller that is slower",
+                key="deadline",
+            )
         if self.duration < self.period:
             raise ModelError(f"period is {self.period} s, longer than the duration {self.duration} s", key="period")
         if not is_multiple(self.duration, self.period):
@@ -143,7 +150,7 @@ class Scene:
         Raises
         ------
         ModelError
-            That period is not a multiple of the plant's step, or the duration not one of it.
+            That period is not a multiple of the plant's step, the duration not one of it, or the deadline beyond it.
         """
         own = self.own_period or self.period
         period = tuning.period or own
