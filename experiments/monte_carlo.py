@@ -29,6 +29,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import binomtest, spearmanr
 
 from pcr_mpc import PCRError, Scene, SimulationError, Tuning, load_scene, load_tuning
+from pcr_mpc.cli_parser import tuning_or_class
+from pcr_mpc.loop.own_controller import OwnController
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.plots import animate_run, plot_run
 from pcr_mpc.report.style import BLUE, GREY, ORANGE, RED, plt
@@ -207,7 +209,7 @@ def workers(jobs: int | None, dask: str | None) -> Iterator[Executor]:
         yield client.get_executor()
 
 
-def replay(scene: Scene, tuning: Tuning, seed: int, folder: Path) -> str:
+def replay(scene: Scene, tuning: Tuning | OwnController, seed: int, folder: Path) -> str:
     """Run one episode once more; write its record and pictures; return its table."""
     try:
         run = simulate_episode(scene, tuning, seed, progress=True)
@@ -225,7 +227,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, write CSV and summary, plot; or replay one episode."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, default=DEFAULT_SCENE, help="default: lemniscate")
-    parser.add_argument("--controller", type=Path, help="controller tuning instead of the scene's own")
+    parser.add_argument("--controller", type=tuning_or_class, metavar="FILE|MODULE:CLASS",
+                        help="controller tuning instead of the scene's own, or a controller of your own")  # fmt: skip
     parser.add_argument(
         "--duration", type=float, default=3.0, help="of an episode [s], at most the scene's (default 3)"
     )
@@ -252,13 +255,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _study(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
-    tuning = load_tuning(options.controller) if options.controller else scene.tuning
+    tuning: Tuning | OwnController | None = scene.tuning
+    if options.controller:
+        own = isinstance(options.controller, str)
+        tuning = OwnController(options.controller) if own else load_tuning(options.controller)
     if tuning is None:
         raise ValueError(f"scene {scene.name} has nothing to track")
     episodes, duration = (8, 1.2) if options.quick else (options.episodes, options.duration)
     if episodes < 1:
         raise ValueError(f"--episodes is {episodes}, expected at least 1")
-    scene = lighter(replace(scene, duration=min(scene.duration, duration))).tuned(tuning)
+    scene = lighter(replace(scene, duration=min(scene.duration, duration)))
+    scene = scene.tuned(tuning) if isinstance(tuning, Tuning) else scene
     folder = options.out or Path("results") / "monte_carlo" / f"{scene.name}_{tuning.name}"
     folder.mkdir(parents=True, exist_ok=True)
     if options.replay is not None:

@@ -25,12 +25,13 @@ if TYPE_CHECKING:
     )
     from .linearisation.linear_model import LinearModel
     from .linearisation.linearise import linearise
-    from .loop.controllers import HoldMotors
+    from .loop.controllers import Controller, Decision, HoldMotors
     from .loop.feasibility import check_scene
     from .loop.run import Run, load_run
     from .loop.scene import Scene, load_scene
     from .loop.simulate import simulate
     from .loop.tracking import TrackingController, make_controller
+    from .loop.trajectory import Trajectory
     from .plant.motion.plant import Plant
     from .plant.motion.rollout import Rollout, rollout
     from .plant.motion.sensitivities import Sensitivities, sensitivities
@@ -41,10 +42,15 @@ if TYPE_CHECKING:
     from .plant.statics.free_tip import forward_statics, inverse_statics
     from .plant.statics.held_tip import solve_statics
     from .plant.statics.stability import Stability, all_equilibria, assess_stability, distance_to_fold
+    from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
+    from .report.tables import equilibria_table, equilibrium_table, summary_table
+    from .study.episodes import Spread, run_episode, simulate_episode
 
 __all__ = [
     "CompilerError",
+    "Controller",
     "ConvergenceError",
+    "Decision",
     "Equilibria",
     "Equilibrium",
     "HoldMotors",
@@ -66,16 +72,21 @@ __all__ = [
     "Scene",
     "Sensitivities",
     "SimulationError",
+    "Spread",
     "Stability",
     "TrackingController",
+    "Trajectory",
     "Tuning",
     "UnreachableError",
     "UnstableError",
     "all_equilibria",
+    "animate_run",
     "assess_stability",
     "build_qp",
     "check_scene",
     "distance_to_fold",
+    "equilibria_table",
+    "equilibrium_table",
     "forward_statics",
     "inverse_statics",
     "linearise",
@@ -84,11 +95,17 @@ __all__ = [
     "load_scene",
     "load_tuning",
     "make_controller",
+    "plot_equilibria",
+    "plot_equilibrium",
+    "plot_run",
     "rollout",
+    "run_episode",
     "sensitivities",
     "simulate",
+    "simulate_episode",
     "solve_statics",
     "solve_statics_batch",
+    "summary_table",
 ]
 
 _WHERE = {
@@ -109,12 +126,13 @@ _WHERE = {
     ),
     "linearisation.linear_model": ("LinearModel",),
     "linearisation.linearise": ("linearise",),
-    "loop.controllers": ("HoldMotors",),
+    "loop.controllers": ("Controller", "Decision", "HoldMotors"),
     "loop.feasibility": ("check_scene",),
     "loop.run": ("Run", "load_run"),
     "loop.scene": ("Scene", "load_scene"),
     "loop.simulate": ("simulate",),
     "loop.tracking": ("TrackingController", "make_controller"),
+    "loop.trajectory": ("Trajectory",),
     "plant.motion.plant": ("Plant",),
     "plant.statics.equilibria": ("Equilibria",),
     "plant.statics.equilibrium": ("Equilibrium",),
@@ -125,6 +143,9 @@ _WHERE = {
     "plant.statics.stability": ("Stability", "all_equilibria", "assess_stability", "distance_to_fold"),
     "plant.statics.held_tip": ("solve_statics",),
     "plant.statics.batch": ("solve_statics_batch",),
+    "report.plots": ("animate_run", "plot_equilibria", "plot_equilibrium", "plot_run"),
+    "report.tables": ("equilibria_table", "equilibrium_table", "summary_table"),
+    "study.episodes": ("Spread", "run_episode", "simulate_episode"),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 

@@ -8,6 +8,7 @@ import os
 import sys
 import traceback
 import warnings
+from pathlib import Path
 
 from . import interrupt
 from .cli_parser import LEAST, parser
@@ -59,7 +60,7 @@ def _check(options: argparse.Namespace) -> None:
         from .toml_table import read_toml
 
         for name in ("scene", "robot", "controller", "start"):
-            if path := getattr(options, name, None):
+            if isinstance(path := getattr(options, name, None), Path):  # not the name of a class
                 read_toml(path)
 
 

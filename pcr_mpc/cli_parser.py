@@ -13,6 +13,7 @@ _EXAMPLES = """\
 examples:
   pcr-mpc track models/scenes/lemniscate.toml            closed loop, pictures and a table
   pcr-mpc track models/scenes/limited.toml --json        the same figures for a machine
+  pcr-mpc track models/scenes/lemniscate.toml --controller mine:Mine   a controller of your own, in mine.py
   pcr-mpc statics models/planar_pair.toml --p 0 0.25 --mode LR     motor angles that hold the tip there
   pcr-mpc statics models/rfrfr.toml --q 120 60 --degrees           where the free tip comes to rest
   pcr-mpc statics models/planar_pair.toml --p 0.18 0.12 --equilibria   what else it could snap to
@@ -24,8 +25,14 @@ examples:
 """
 
 LINKS = 40
+_CLASS = re.compile(r".+:[A-Za-z_]\w*")
 # Least values of the options that are whole numbers.
 LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1}
+
+
+def tuning_or_class(text: str) -> Path | str:
+    """Path of a tuning, or ``module:Class`` as it stands."""
+    return text if _CLASS.fullmatch(text) and not Path(text).exists() else Path(text)
 
 
 class _Version(argparse.Action):
@@ -67,7 +74,9 @@ def parser() -> argparse.ArgumentParser:
         "track", "cli_track", "track", "Run a scene in closed loop; write its record, a picture and an animation."
     )
     track.add_argument("scene", type=Path, help="scene file, such as models/scenes/lemniscate.toml")
-    track.add_argument("--controller", type=Path, help="controller tuning instead of the scene's own")
+    track.add_argument("--controller", type=tuning_or_class, metavar="FILE|MODULE:CLASS",
+                       help="controller tuning instead of the scene's own, or a controller of your own, such as "
+                       "mine:Mine for class Mine in mine.py")  # fmt: skip
     track.add_argument("--method", choices=METHODS, help="statics of the plant instead of the scene's own")
     track.add_argument("--plant", choices=("mujoco",), help="simulate the robot with MuJoCo instead (extra 'mujoco')")
     track.add_argument("--links", type=int, help="of each rod, with --plant mujoco (default 40)")

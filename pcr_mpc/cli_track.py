@@ -12,10 +12,12 @@ from typing import Any
 
 from . import interrupt
 from .cli_parser import LINKS
-from .control.tuning import load_tuning
+from .control.tuning import Tuning, load_tuning
 from .errors import OutputError, PCRError, SimulationError
 from .files import require_folder, results, saved
+from .loop.controllers import Controller
 from .loop.model_inertia import by_model_inertia
+from .loop.own_controller import OwnController
 from .loop.run import RECORD, Run
 from .loop.scene import load_scene
 from .loop.simulate import simulate
@@ -31,11 +33,13 @@ _PICTURES = ("track.png", "track.gif")
 def track(options: argparse.Namespace) -> int:
     """Run `pcr-mpc track`."""
     scene = load_scene(options.scene)
-    tuning = load_tuning(options.controller) if options.controller else None
+    own = OwnController(options.controller) if isinstance(options.controller, str) else None
+    tuning = load_tuning(options.controller) if options.controller and own is None else None
     if tuning and scene.trajectory is None:
         raise ValueError(f"scene {scene.name} has nothing to track, so --controller has no use")
     if tuning:
         scene = scene.tuned(tuning)
+    controller: Controller = make_controller(scene, tuning) if own is None else own(scene)
     if options.plant and options.method:
         raise ValueError("--method has no use with --plant: MuJoCo solves no statics")
     if options.links is not None and not options.plant:
@@ -51,12 +55,12 @@ def track(options: argparse.Namespace) -> int:
     require_folder(folder, RECORD if options.no_pictures else (*RECORD, *_PICTURES), force=options.overwrite)
     failure: SimulationError | None = None
     try:
-        run = simulate(scene, plant, make_controller(scene, tuning), options.seed, progress=True)
+        run = simulate(scene, plant, controller, options.seed, progress=True)
     except SimulationError as error:
         failure, run = error, error.run
     folder, problem = saved(partial(run.save, force=options.overwrite), folder)
     summary = run.summary()
-    used = tuning or scene.tuning
+    used: Tuning | None = None if own else tuning or scene.tuning
     if options.plant and used is not None and failure is None:
         summary["by_model_inertia"] = by_model_inertia(run, used, plant, progress=True)
     # Of a run that was interrupted the record is enough: who presses Ctrl-C wants no pictures.

@@ -32,19 +32,16 @@ def changed(**attributes):
     return kind()
 
 
-NAMELESS = type("Nameless", (), {"start": Mine.start, "step": Mine.step})()
-
-
 @pytest.mark.parametrize(
     ("controller", "message"),
     [
-        (NAMELESS, "controller Nameless has no 'name'; see pcr_mpc.loop.controllers.Controller"),
+        (changed(start=None), "controller Mine has no method 'start'; see pcr_mpc.loop.controllers.Controller"),
         (changed(name=3), "controller Mine has name = 3, expected a str"),
         (changed(step=lambda self, x: None), r"controller Mine: step\(x\) is called with 2 arguments"),
         (changed(start=lambda self: None), r"controller Mine: start\(\) is called with 1 arguments"),
         (changed(step=None), "controller Mine has no method 'step'"),
         (Mine, "controller is the class Mine, expected an object"),
-        (None, "controller NoneType has no 'name'"),
+        (None, "controller NoneType has no method 'start'"),
     ],
 )
 def test_a_controller_that_does_not_fit_is_named_before_the_start(scene, controller, message):
@@ -83,8 +80,10 @@ def throw(error):
         (throw(AssertionError()), "AssertionError"),
         (lambda k: sys.exit(3), "SystemExit: 3"),
         (throw(KeyboardInterrupt()), "interrupted"),
-        (lambda k: None, "AttributeError"),
-        (lambda k: np.zeros(2), "AttributeError"),
+        (lambda k: None, "TypeError: the controller's step returned None, expected 2 motor rates or a Decision"),
+        (lambda k: np.zeros(3), r"the controller's u has shape \(3,\), expected \(2,\)"),
+        (lambda k: 0.0, r"the controller's u has shape \(\), expected \(2,\)"),
+        (lambda k: "stop", "the controller's u is 'stop', expected numbers"),
         (lambda k: Decision(np.zeros(1)), r"the controller's u has shape \(1,\), expected \(2,\)"),
         (lambda k: Decision(np.full(2, np.nan)), "the controller's u is not finite"),
     ],

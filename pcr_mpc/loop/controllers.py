@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..control.plan import Plan
-from ..errors import checked_period
+from ..errors import checked_period, checked_vector
 from ..frozen import read_only
 from ..plant.statics.equilibrium import Equilibrium
 
@@ -42,15 +43,50 @@ class Decision:
 
 
 class Controller(Protocol):
-    """What `simulate` needs."""
+    """What `simulate` needs: two methods.
 
-    name: str
+    A ``name``, if there is one, is what the record calls the controller; else it is called by its class.
+    """
 
     def start(self, pose: Equilibrium) -> None:
         """Get ready: the robot rests in ``pose``."""
 
-    def step(self, k: int, x: np.ndarray) -> Decision:
-        """Decide on period k from the measured state."""
+    def step(self, k: int, x: np.ndarray) -> Decision | ArrayLike:
+        """Decide on period k from the measured state [m, m/s, rad]; motor rates [rad/s] will do as an answer."""
+
+
+def decision_of(answer: Any, n: int) -> Decision:
+    """Return the answer of a controller's step as a `Decision` with checked rates.
+
+    Parameters
+    ----------
+    answer : Decision or array_like, shape (n,)
+        Motor rates [rad/s], or a decision that holds them.
+    n : int
+        Number of motors.
+
+    Raises
+    ------
+    TypeError
+        It is neither.
+    ValueError
+        The rates are not finite or of the wrong shape.
+    """
+    if isinstance(answer, Decision):
+        checked_vector("the controller's u", answer.u, n)  # NumPy would spread one number over all motors
+        return answer
+    if answer is None or hasattr(answer, "u"):
+        raise TypeError(f"the controller's step returned {answer!r}, expected {n} motor rates or a Decision")
+    if np.shape(answer) in ((n, 1), (1, n)):
+        answer = np.reshape(answer, n)
+    # A copy: whoever returns an array may write into it again.
+    return Decision(checked_vector("the controller's u", answer, n).copy())
+
+
+def name_of(controller: Any) -> str:
+    """Name of a controller in a record: its own, else that of its class."""
+    name = getattr(controller, "name", None)
+    return type(controller).__name__ if name is None else str(name)
 
 
 class Replay:

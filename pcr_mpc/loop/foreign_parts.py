@@ -6,8 +6,9 @@ import inspect
 from numbers import Real
 from typing import Any
 
-# What is called, with how many arguments; and what is only read, and of which type.
+# What is called, with how many arguments; what is only read, and of which type; and what of that may be missing.
 _CONTROLLER = {"start": 1, "step": 2}, {"name": str}
+_OPTIONAL = ("name",)
 _PLANT = (
     {"reset": 2, "carry": 2, "step": 3},
     {"method": str, "integrator": str, "dt": Real, "snaps": list, "rungs": dict},
@@ -28,6 +29,8 @@ def check_parts(plant: Any, controller: Any, *, carries: bool) -> None:
         if inspect.isclass(part):
             raise ValueError(f"{role} is the class {part.__name__}, expected an object: call it first")
         for name, wanted in attributes.items():
+            if not hasattr(part, name) and name in _OPTIONAL:
+                continue
             if not hasattr(part, name):
                 raise ValueError(f"{role} {kind} has no {name!r}; {hint}")
             value = getattr(part, name)

@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 from .. import interrupt
 from ..control.tuning import Tuning
-from ..errors import SimulationError, checked_array, checked_integer, checked_vector
+from ..errors import SimulationError, checked_array, checked_integer
 from ..plant.robot import Robot
-from .controllers import Controller
+from .controllers import Controller, decision_of, name_of
 from .feasibility import reference_excess
 from .feed_forward import InverseDynamics
 from .foreign_parts import check_parts
@@ -43,7 +43,7 @@ def simulate(
     plant : SimulatedPlant
         What really moves; its step must divide the scene's control period.
     controller : Controller
-        Sees the measured state only, and predicts with a model of its own.
+        Sees the measured state only, and predicts with a model of its own. Any object with ``start`` and ``step``.
     seed : int
         Of the measurement noise.
     spent : callable, optional
@@ -114,7 +114,7 @@ def simulate(
         t = plant.dt * np.arange(done + 1)
         return Run(
             scene=scene,
-            controller=controller.name,
+            controller=name_of(controller),
             plant=f"{plant.method}, {plant.integrator}, dt = {1e3 * plant.dt:g} ms",
             seed=seed,
             pose=pose,
@@ -153,11 +153,11 @@ def simulate(
                 measured[4:] -= 2 * np.pi * np.ceil(measured[4:] / (2 * np.pi) - 0.5)
             measurements[k] = measured
             began, began_cpu = time.perf_counter(), time.thread_time()
-            decision = controller.step(k, measured)
+            answer = controller.step(k, measured)
             control_time[k, 0] = time.perf_counter() - began
             control_time[k, 5] = time.thread_time() - began_cpu
-            # Named here: NumPy would spread one number over all motors.
-            inputs[k] = checked_vector("the controller's u", decision.u, n)
+            decision = decision_of(answer, n)
+            inputs[k] = decision.u
             if decision.estimate is not None:
                 estimates[k] = decision.estimate
             if decision.force is not None:
@@ -188,8 +188,8 @@ def simulate(
                         }
                     )
             foreseen = scene.late == "shifted_plan" and decision.plan is not None and len(decision.plan.inputs) > 1
-            after = decision.plan.inputs[1] if foreseen and decision.plan is not None else decision.u
-            on_the_way.append((decision.u, late, after))
+            after = decision.plan.inputs[1] if foreseen and decision.plan is not None else inputs[k]
+            on_the_way.append((inputs[k], late, after))
             arrived, waiting, after = on_the_way.popleft()
             for j in range(per):
                 interrupt.check()

@@ -26,7 +26,7 @@ from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.symbolic import rod_unknowns, symbolic_dynamics
-from .controllers import Controller, Decision, HoldMotors
+from .controllers import Decision, HoldMotors
 from .feed_forward import InverseDynamics, feed_forward, held
 from .foresight import Foresight, Outlook
 from .foresight_graph import Places
@@ -443,7 +443,7 @@ def motor_limits(robot: Robot, period: float) -> Limits:
 
 def make_controller(
     scene: Scene, tuning: Tuning | None = None, robot: Robot | None = None, reference: InverseDynamics | None = None
-) -> Controller:
+) -> TrackingController | HoldMotors:
     """Build the controller of a scene: that of its tuning, or none where there is nothing to track.
 
     Parameters

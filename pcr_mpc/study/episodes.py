@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -15,13 +16,16 @@ import numpy as np
 from .. import interrupt
 from ..control.tuning import Tuning
 from ..errors import SimulationError, checked_integer, checked_number
+from ..loop.controllers import Controller
 from ..loop.feed_forward import InverseDynamics, feed_forward
+from ..loop.own_controller import built
 from ..loop.run import Run
 from ..loop.scene import Scene
 from ..loop.simulate import simulate
 from ..loop.tracking import make_controller
 
 Row = dict[str, Any]
+Maker = Callable[..., Controller]
 # An episode fails if the tip is further than this from its reference [m]: a third of the lemniscate's height, and
 # almost four times as far as the largest load of a `Spread` moves the resting tip.
 ALLOWED_ERROR = 0.02
@@ -174,23 +178,36 @@ def lighter(scene: Scene) -> Scene:
 
 
 def simulate_episode(
-    scene: Scene, tuning: Tuning, seed: int, spread: Spread = Spread(), *, progress: bool = False
+    scene: Scene, tuning: Tuning | Maker, seed: int, spread: Spread = Spread(), *, progress: bool = False
 ) -> Run:
     """Run the episode of a seed: the sampled robot moves, the controller knows the scene's.
 
     Late decisions are not simulated, even where the scene has a deadline: an episode must not depend on how busy the
     machine is.
 
+    Parameters
+    ----------
+    scene : Scene
+    tuning : Tuning or callable
+        Of the controller; or what makes one of one's own (see `built`), a class for example, which is handed the scene
+        as it is believed to be.
+    seed : int
+    spread : Spread
+    progress : bool
+
     Raises
     ------
     SimulationError
         As `simulate`.
     """
-    believed = replace(scene.tuned(tuning), deadline=math.inf)
+    believed = replace(scene if not isinstance(tuning, Tuning) else scene.tuned(tuning), deadline=math.inf)
     mismatch = spread.sample(scene.robot.n_rods, seed)
     # A tuning with a shorter period does not make the bus faster.
     delay = math.ceil(mismatch.delay * scene.period / believed.period - 1e-9)
     true = replace(mismatch, delay=delay).applied_to(believed)
+    if not isinstance(tuning, Tuning):
+        mine = built(tuning, replace(believed, angle_step=true.angle_step))
+        return simulate(true, true.make_plant(), mine, seed, progress=progress)
     reference = None
     if believed.trajectory is not None:
         tail = tuning.horizon + believed.delay
@@ -208,7 +225,7 @@ def _reference(believed: Scene, horizon: int, inertia: str) -> InverseDynamics:
     return feed_forward(believed, believed.robot, believed.start(), horizon, inertia)
 
 
-def run_episode(scene: Scene, tuning: Tuning, seed: int, spread: Spread = Spread()) -> Row:
+def run_episode(scene: Scene, tuning: Tuning | Maker, seed: int, spread: Spread = Spread()) -> Row:
     """Run the episode of a seed and judge it; a failing one is a row like the others.
 
     Returns

@@ -11,19 +11,22 @@ from typing import Any
 
 from ..control.tuning import Tuning
 from ..loop.finding import own_motion
+from ..loop.own_controller import OwnController
 from ..loop.scene import Scene
 from ..plain import plain
-from .episodes import Spread
+from .episodes import Maker, Spread
 
 _PACKAGE = Path(__file__).parent.parent
 
 
-def described(scene: Scene, tuning: Tuning, spread: Spread) -> dict[str, Any]:
+def described(scene: Scene, tuning: Tuning | Maker, spread: Spread) -> dict[str, Any]:
     """Everything that decides what an episode of a given seed does, ready for JSON."""
-    scene = scene.tuned(tuning)
+    scene = scene.tuned(tuning) if isinstance(tuning, Tuning) else scene
     reference: dict[str, Any] = {"reference": type(scene.trajectory).__name__}
     if own := own_motion(scene):
         reference["trajectory"] = own
+    if not isinstance(tuning, Tuning):
+        reference["controller"] = tuning.described() if isinstance(tuning, OwnController) else plain(tuning)
     # What is compared must have been through JSON, too.
     return dict(json.loads(json.dumps({"scene": plain(scene) | reference, "spread": plain(spread)})))
 
