@@ -1,0 +1,12 @@
+"""A controller changed in Python: what the input weight does on the figure of eight."""
+
+from dataclasses import replace
+
+from pcr_mpc import load_scene, load_tuning, make_controller, simulate
+
+scene = replace(load_scene("models/scenes/lemniscate.toml"), duration=2.0)
+tuning = load_tuning("controllers/default.toml")
+for weight in (1e-3, 1e-2, 1e-1):
+    controller = make_controller(scene, replace(tuning, input_weight=weight))
+    run = simulate(scene, scene.make_plant(), controller)
+    print(f"input weight {weight:g}: {run.summary()['rms_after_1s_mm']:.5f} mm RMS after 1 s")
