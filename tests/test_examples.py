@@ -6,7 +6,6 @@ import pytest
 
 from .conftest import ROOT
 
-
 SLOW = ("what_else_is_stable",)
 EXAMPLES = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in SLOW else [])
