@@ -32,10 +32,12 @@ if TYPE_CHECKING:
     from .loop.simulate import simulate
     from .loop.tracking import TrackingController, make_controller
     from .loop.trajectory import Trajectory
+    from .plant.materials import MATERIALS, Material, Section
     from .plant.motion.plant import Plant
     from .plant.motion.rollout import Rollout, rollout
     from .plant.motion.sensitivities import Sensitivities, sensitivities
-    from .plant.robot import Robot, Rod, load_robot
+    from .plant.robot import Robot, load_robot
+    from .plant.rod import Rod
     from .plant.statics.batch import solve_statics_batch
     from .plant.statics.equilibria import Equilibria
     from .plant.statics.equilibrium import Equilibrium
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from .study.episodes import Spread, run_episode, simulate_episode
 
 __all__ = [
+    "MATERIALS",
     "CompilerError",
     "Controller",
     "ConvergenceError",
@@ -58,6 +61,7 @@ __all__ = [
     "Limits",
     "LinearMPC",
     "LinearModel",
+    "Material",
     "MeasurementError",
     "ModelError",
     "PCRError",
@@ -70,6 +74,7 @@ __all__ = [
     "Rollout",
     "Run",
     "Scene",
+    "Section",
     "Sensitivities",
     "SimulationError",
     "Spread",
@@ -137,7 +142,9 @@ _WHERE = {
     "plant.statics.equilibria": ("Equilibria",),
     "plant.statics.equilibrium": ("Equilibrium",),
     "plant.statics.free_tip": ("forward_statics", "inverse_statics"),
-    "plant.robot": ("Robot", "Rod", "load_robot"),
+    "plant.materials": ("MATERIALS", "Material", "Section"),
+    "plant.robot": ("Robot", "load_robot"),
+    "plant.rod": ("Rod",),
     "plant.motion.rollout": ("Rollout", "rollout"),
     "plant.motion.sensitivities": ("Sensitivities", "sensitivities"),
     "plant.statics.stability": ("Stability", "all_equilibria", "assess_stability", "distance_to_fold"),

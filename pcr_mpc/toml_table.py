@@ -37,8 +37,8 @@ _UNDESCRIBED = {
     ("contact", "obstacle", "collision", "ground", "wall"): "contact with anything is not described",
     ("torsion", "twist", "shear", "poisson", "z"): "the robot is planar: there is no torsion, shear or third axis",
     ("plastic", "fatigue", "temperature"): "the rods are elastic and nothing else is described",
-    ("young", "elastic", "diameter", "radius", "thickness", "width"): "rods are described by "
-    "bending_stiffness [N m^2] and line_density [kg/m], which follow from material and cross-section",
+    ("young", "elastic", "radius"): "rods are described by "
+    "bending_stiffness [N m^2] and line_density [kg/m], or by material (or youngs_modulus and density) and diameter",
 }
 
 

@@ -163,10 +163,10 @@ def test_a_scene_without_a_reference_has_nothing_to_tune():
         ("rod", "tendon", None, "tendons are not described"),
         ("rod", "friction", None, "no friction"),
         ("rod", "torsion_stiffness", None, "planar"),
-        ("rod", "youngs_modulus", None, "bending_stiffness"),
+        ("rod", "elasticity", None, "bending_stiffness"),
         ("rod", "colour", None, r"unknown key \(known here: base, length,"),
         ("rod", "curvatur", "curvature", "did you mean 'curvature'"),
-        ("rod", "density", "line_density", "did you mean 'line_density'"),
+        ("rod", "densty", "density", "did you mean 'density'"),
     ],
 )
 def test_only_what_is_near_is_suggested(files, place, key, nearest, words):

@@ -17,7 +17,8 @@ from ..control.observer import ObserverTuning
 from ..control.tuning import Model, Tuning
 from ..errors import ModelError
 from ..linearisation.pose_limits import PoseLimits
-from ..plant.robot import Robot, Rod
+from ..plant.robot import Robot
+from ..plant.rod import Rod
 from ..plant.statics.equilibrium import Equilibrium
 from .scene import Scene
 from .settings import Finding, Need, Payload, PlantSettings

@@ -11,98 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, UnreachableError, check_numbers, checked_number, checked_vector
+from ..errors import ModelError, UnreachableError, check_numbers, checked_vector
 from ..files import name_problem
 from ..frozen import Frozen, read_only
 from ..toml_table import read_toml
+from .rod import MANY_TURNS, NOT_NEGATIVE, POSITIVE, Rod, doubtful_limits, read_rod
 
-# SI units; wide enough for DNA and for bridges, and no product of a few such numbers overflows.
-_POSITIVE = {"minimum": 1e-30, "maximum": 1e30}
-_NOT_NEGATIVE = {"minimum": 0.0, "maximum": 1e30}
-_ROD_NUMBERS = {"length": _POSITIVE, "bending_stiffness": _POSITIVE, "line_density": _NOT_NEGATIVE}
-# Of EI along a rod, relative to EI.
-_STIFFNESS_RANGE = (1e-3, 1e3)
 # Strain of a rod that can stretch beyond which no rod is elastic.
 _LARGEST_STRAIN = 0.01
-_MOST_KNOTS = 65  # of a property along a rod
 _ROBOT_NUMBERS = {
-    "tip_mass": _POSITIVE,
-    "drag": _NOT_NEGATIVE,
-    "rate_limit": _POSITIVE,
-    "acceleration_limit": _POSITIVE,
-    "torque_limit": _POSITIVE,
+    "tip_mass": POSITIVE,
+    "drag": NOT_NEGATIVE,
+    "rate_limit": POSITIVE,
+    "acceleration_limit": POSITIVE,
+    "torque_limit": POSITIVE,
 }
 # Fraction of the length by which a rod must fall short of straight: closer, the rounding of the tip position alone
 # decides the force.
 _LEAST_SLACK = 1e-9
 # Beyond it the rounding of an angle, 1e-10 rad, shows in the shape of a rod [rad].
 _LARGEST_ANGLE = 1e6
-# Angles beyond four turns are rather degrees [rad].
-_MANY_TURNS = 8.0 * math.pi
-
-
-@dataclass(frozen=True)
-class Rod:
-    """An elastic rod clamped to its motor; uniform, inextensible and straight at rest unless it says otherwise.
-
-    Attributes
-    ----------
-    base : (float, float)
-        Motor axis in the world frame [m].
-    length : float
-        Length L [m].
-    bending_stiffness : float
-        EI [N m^2].
-    line_density : float
-        Mass per length [kg/m]; the massless model of the paper does not use it.
-    angle_limits : (float, float)
-        Least and greatest motor angle [rad]; refused where they hold no angle within four turns of zero.
-    curvature : float or tuple of float
-        kappa0 at rest [1/m], positive to the left: one number, or values at equally spaced s from base to tip, linear
-        in between.
-    stiffness_factors : tuple of float
-        EI(s)/EI, likewise.
-    axial_stiffness : float
-        EA [N]; infinite for a rod that does not stretch.
-    """
-
-    base: tuple[float, float]
-    length: float
-    bending_stiffness: float
-    line_density: float
-    angle_limits: tuple[float, float]
-    curvature: float | tuple[float, ...] = 0.0
-    stiffness_factors: tuple[float, ...] = (1.0,)
-    axial_stiffness: float = math.inf
-
-    def __post_init__(self) -> None:
-        check_numbers(self, _ROD_NUMBERS)
-        lowest, highest = _STIFFNESS_RANGE
-        _check_profile(self, "curvature", minimum=-1e30, maximum=1e30)
-        _check_profile(self, "stiffness_factors", minimum=lowest, maximum=highest)
-        if self.axial_stiffness != math.inf:
-            check_numbers(self, {"axial_stiffness": _POSITIVE})
-        for name in ("base", "angle_limits"):
-            pair = checked_vector(name, getattr(self, name), 2)
-            object.__setattr__(self, name, tuple(pair.tolist()))
-        lower, upper = self.angle_limits
-        if lower >= upper:
-            raise ModelError(f"angle_limits: lower {lower} is not below upper {upper}", key="angle_limits")
-        if lower > _MANY_TURNS or upper < -_MANY_TURNS:
-            raise ModelError(
-                f"angle_limits: {_doubtful_limits(self)}; take off the whole turns, or write radians",
-                key="angle_limits",
-            )
-
-    @property
-    def curvatures(self) -> tuple[float, ...]:
-        """kappa0 at its knots [1/m]."""
-        return self.curvature if isinstance(self.curvature, tuple) else (self.curvature,)
-
-    @property
-    def stretches(self) -> bool:
-        """Whether EA is finite."""
-        return self.axial_stiffness != math.inf
 
 
 @dataclass(frozen=True)
@@ -249,31 +177,6 @@ class Robot(Frozen):
                 )
 
 
-def _doubtful_limits(rod: Rod) -> str:
-    low, high = rod.angle_limits
-    degrees = [math.radians(angle) for angle in rod.angle_limits]
-    return (
-        f"[{low:g}, {high:g}] rad reach {max(-low, high) / (2 * math.pi):.3g} turns from zero; if these are degrees, "
-        f"they are [{degrees[0]:.4g}, {degrees[1]:.4g}] rad"
-    )
-
-
-def _check_profile(rod: Rod, key: str, *, minimum: float, maximum: float) -> None:
-    """Replace a property along the rod by a tuple of floats, or by a float if it is one number."""
-    value = getattr(rod, key)
-    try:
-        if isinstance(value, tuple | list | np.ndarray):
-            values = tuple(checked_number(key, v, minimum=minimum, maximum=maximum) for v in value)
-            if not values or len(values) > _MOST_KNOTS:
-                raise ValueError(f"{key}: expected 1 to {_MOST_KNOTS} numbers, found {len(values)}")
-            object.__setattr__(rod, key, values)
-        else:
-            number = checked_number(key, value, minimum=minimum, maximum=maximum)
-            object.__setattr__(rod, key, number if key == "curvature" else (number,))
-    except ValueError as error:
-        raise ModelError(str(error), key=key) from None
-
-
 def load_robot(path: str | Path) -> Robot:
     """Read a robot from TOML (see ``models/planar_pair.toml``).
 
@@ -292,20 +195,9 @@ def load_robot(path: str | Path) -> Robot:
         rods: list[Rod] = []
         for table in file.tables("rods"):
             with table:
-                rods.append(
-                    Rod(
-                        base=table.vector("base", 2),
-                        length=table.number("length"),
-                        bending_stiffness=table.number("bending_stiffness"),
-                        line_density=table.number("line_density"),
-                        angle_limits=table.vector("angle_limits", 2),
-                        curvature=table.profile("curvature", 0.0),
-                        stiffness_factors=table.profile("stiffness_factors", (1.0,)),
-                        axial_stiffness=table.number("axial_stiffness", math.inf),
-                    )
-                )
-            if max(map(abs, rods[-1].angle_limits)) > _MANY_TURNS:
-                warnings.warn(f"{path}: rods.angle_limits: {_doubtful_limits(rods[-1])}", stacklevel=2)
+                rods.append(read_rod(table))
+            if max(map(abs, rods[-1].angle_limits)) > MANY_TURNS:
+                warnings.warn(f"{path}: rods.angle_limits: {doubtful_limits(rods[-1])}", stacklevel=2)
         with file.table("world", {}) as world:
             gravity = world.vector("gravity", 2, (0.0, 0.0))
         with file.table("tip") as tip, file.table("motors") as motors:

@@ -16,7 +16,7 @@ from ..errors import PCRError
 from ..loop.scene import Scene
 from ..loop.settings import PlantSettings
 from ..plant.motion.plant import Plant
-from ..plant.robot import Rod
+from ..plant.rod import Rod
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.free_tip import inverse_statics
 from ..plant.statics.held_tip import solve_statics

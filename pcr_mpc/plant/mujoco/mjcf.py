@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...errors import ModelError
-from ..robot import Robot, Rod
+from ..robot import Robot
+from ..rod import Rod
 from ..statics.equilibrium import Equilibrium
 from .hinge_chain import ChainState, Hinges, hinges, settled_chains
 

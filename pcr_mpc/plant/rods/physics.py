@@ -10,7 +10,8 @@ import numpy as np
 
 from ...errors import ModelError
 from ...frozen import read_only
-from ..robot import Robot, Rod
+from ..robot import Robot
+from ..rod import Rod
 from .equations import Layout, RodPhysics
 
 _MOST_INTERVALS = 128
