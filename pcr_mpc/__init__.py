@@ -8,6 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .catalogue import shipped
     from .control.mpc import LinearMPC
     from .control.plan import Plan
     from .control.qp import QuadraticProgram, Reference, build_qp
@@ -106,6 +107,7 @@ __all__ = [
     "rollout",
     "run_episode",
     "sensitivities",
+    "shipped",
     "simulate",
     "simulate_episode",
     "solve_statics",
@@ -114,6 +116,7 @@ __all__ = [
 ]
 
 _WHERE = {
+    "catalogue": ("shipped",),
     "control.mpc": ("LinearMPC",),
     "control.plan": ("Plan",),
     "control.qp": ("QuadraticProgram", "Reference", "build_qp"),

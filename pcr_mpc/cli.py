@@ -13,6 +13,9 @@ from pathlib import Path
 from . import interrupt
 from .cli_parser import LEAST, parser
 
+# Arguments that name a file: a path, or the name of one of these kinds that comes with the package.
+_FILES = {"scene": ("scene",), "robot": ("robot",), "controller": ("tuning",), "start": ("tuning",)}
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status: 1 for a failure, 130 for Ctrl-C."""
@@ -59,9 +62,26 @@ def _check(options: argparse.Namespace) -> None:
     with interrupt.nothing_to_lose():
         from .toml_table import read_toml
 
-        for name in ("scene", "robot", "controller", "start"):
-            if isinstance(path := getattr(options, name, None), Path):  # not the name of a class
+        options.named = []
+        for name, kinds in _FILES.items():
+            given = getattr(options, name, None)
+            if given and not (name == "controller" and isinstance(given, str)):  # else the name of a class
+                path, by_name = _found(str(given), kinds)
                 read_toml(path)
+                setattr(options, name, path)
+                options.named += [name] if by_name else []
+
+
+def _found(given: str, kinds: tuple[str, ...]) -> tuple[Path, bool]:
+    """File that is meant by a path or a name, and whether it is by a name that it comes with the package."""
+    from .catalogue import is_name, kinds_of, shipped
+
+    if not is_name(given):
+        return Path(given), False
+    kind = next((one for one in kinds_of(given) if one in kinds), None)
+    if kind is None and Path(given).is_file():
+        return Path(given), False
+    return shipped(given, kind or kinds[0]), True
 
 
 def _message(error: BaseException, stopped: bool) -> str:

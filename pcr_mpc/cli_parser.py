@@ -7,21 +7,24 @@ import re
 from pathlib import Path
 from typing import Any
 
+from .catalogue import KINDS
 from .methods import METHODS
 
 _EXAMPLES = """\
 examples:
-  pcr-mpc track models/scenes/lemniscate.toml            closed loop, pictures and a table
-  pcr-mpc track models/scenes/limited.toml --json        the same figures for a machine
-  pcr-mpc track models/scenes/lemniscate.toml --controller mine:Mine   a controller of your own, in mine.py
-  pcr-mpc statics models/planar_pair.toml --p 0 0.25 --mode LR     motor angles that hold the tip there
-  pcr-mpc statics models/rfrfr.toml --q 120 60 --degrees           where the free tip comes to rest
-  pcr-mpc statics models/planar_pair.toml --p 0.18 0.12 --equilibria   what else it could snap to
-  pcr-mpc track models/scenes/lemniscate.toml --plant mujoco       against another engine's robot
-  pcr-mpc export models/planar_pair.toml --p 0 0.25 --mode LR --out pair.xml     that robot as MJCF
-  pcr-mpc choose models/scenes/vertical.toml             what physics the scene needs, and why
-  pcr-mpc timing models/scenes/lemniscate.toml           step times against the real-time budgets
-  pcr-mpc tune models/scenes/pick_and_place.toml --trials 20 --jobs 2 --out better.toml     a better controller
+  pcr-mpc track lemniscate                              closed loop, pictures and a table
+  pcr-mpc track limited --json                          the same figures for a machine
+  pcr-mpc track lemniscate --controller mine:Mine       a controller of your own, in mine.py
+  pcr-mpc statics planar_pair --p 0 0.25 --mode LR      motor angles that hold the tip there
+  pcr-mpc statics rfrfr --q 120 60 --degrees            where the free tip comes to rest
+  pcr-mpc statics planar_pair --p 0.18 0.12 --equilibria           what else it could snap to
+  pcr-mpc track lemniscate --plant mujoco               against another engine's robot
+  pcr-mpc export planar_pair --p 0 0.25 --mode LR --out pair.xml   that robot as MJCF
+  pcr-mpc choose vertical                               what physics the scene needs, and why
+  pcr-mpc timing lemniscate                             step times against the real-time budgets
+  pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
+  pcr-mpc copy lemniscate mine                          a copy of that scene to change
+Where a file is wanted, a name is one of pcr-mpc models; a path, such as ./mine/scene.toml, is that file.
 """
 
 LINKS = 40
@@ -65,7 +68,9 @@ def parser() -> argparse.ArgumentParser:
         sub.add_argument("--traceback", action="store_true", help="show the traceback of a failure")
         # The force of `statics` is one in newtons.
         flags = ("--overwrite",) if name == "statics" else ("--force", "--overwrite")
-        if name != "choose":
+        if name in ("copy", "new"):
+            sub.add_argument(*flags, dest="overwrite", action="store_true", help="overwrite files that are there")
+        elif name not in ("choose", "models"):
             sub.add_argument(*flags, dest="overwrite", action="store_true",
                              help="overwrite files that pcr-mpc did not write, or that were changed since")  # fmt: skip
         return sub
@@ -73,10 +78,10 @@ def parser() -> argparse.ArgumentParser:
     track = command(
         "track", "cli_track", "track", "Run a scene in closed loop; write its record, a picture and an animation."
     )
-    track.add_argument("scene", type=Path, help="scene file, such as models/scenes/lemniscate.toml")
-    track.add_argument("--controller", type=tuning_or_class, metavar="FILE|MODULE:CLASS",
-                       help="controller tuning instead of the scene's own, or a controller of your own, such as "
-                       "mine:Mine for class Mine in mine.py")  # fmt: skip
+    track.add_argument("scene", help="scene: a file, or a name such as lemniscate of pcr-mpc models")
+    track.add_argument("--controller", type=tuning_or_class, metavar="FILE|NAME|MODULE:CLASS",
+                       help="tuning instead of the scene's own: a file, or a name of pcr-mpc models; or a controller of "
+                       "your own, such as mine:Mine for class Mine in mine.py")  # fmt: skip
     track.add_argument("--method", choices=METHODS, help="statics of the plant instead of the scene's own")
     track.add_argument("--plant", choices=("mujoco",), help="simulate the robot with MuJoCo instead (extra 'mujoco')")
     track.add_argument("--links", type=int, help="of each rod, with --plant mujoco (default 40)")
@@ -90,7 +95,7 @@ def parser() -> argparse.ArgumentParser:
         "solve_pose",
         "Solve a pose: give --p and --q, or one of them to find the other in balance with --force.",
     )
-    statics.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
+    statics.add_argument("robot", help="robot: a file, or a name such as planar_pair of pcr-mpc models")
     statics.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), help="tip position [m]")
     statics.add_argument("--q", type=float, nargs="+", metavar="A", help="motor angles [rad]")
     statics.add_argument("--degrees", action="store_true", help="motor angles are given in degrees")
@@ -107,7 +112,7 @@ def parser() -> argparse.ArgumentParser:
     statics.add_argument("--picture", type=Path, metavar="FILE", help="draw the pose into FILE")
 
     mjcf = command("export", "cli_statics", "export", "Write a robot in balance as a model file of MuJoCo (MJCF).")
-    mjcf.add_argument("robot", type=Path, help="robot file, such as models/planar_pair.toml")
+    mjcf.add_argument("robot", help="robot: a file, or a name such as planar_pair of pcr-mpc models")
     mjcf.add_argument("--p", type=float, nargs=2, metavar=("X", "Y"), required=True, help="tip position [m]")
     mjcf.add_argument("--mode", help="working mode, a letter L or R per rod, such as LR")
     mjcf.add_argument("--links", type=int, default=LINKS, help=f"of each rod (default {LINKS})")
@@ -119,7 +124,7 @@ def parser() -> argparse.ArgumentParser:
         "choose_rung",
         "Find the lowest physics and the cheapest discretisation that meet what a scene's [need] table asks for.",
     )
-    choice.add_argument("scene", type=Path, help="scene file, such as models/scenes/vertical.toml")
+    choice.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
     choice.add_argument("--write", action="store_true", help="put the chosen rung into the scene's [plant] table")
 
     timing = command(
@@ -128,7 +133,7 @@ def parser() -> argparse.ArgumentParser:
         "time_loop",
         "Time plant steps of every method and the control step against their budgets; draw it.",
     )
-    timing.add_argument("scene", type=Path, help="scene file")
+    timing.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
     timing.add_argument("--steps", type=int, default=100_000,
                         help="plant steps and control steps (default 100000: two or three minutes)")  # fmt: skip
     timing.add_argument("--out", type=Path, help="folder for the results (default results/timing/NAME)")
@@ -140,8 +145,8 @@ def parser() -> argparse.ArgumentParser:
         "Search for a better tuning of a scene's linear MPC, with Optuna; write it if there is one. "
         "A study goes on where the last call with the same settings ended.",
     )
-    tuning.add_argument("scene", type=Path, help="scene file")
-    tuning.add_argument("--start", type=Path, metavar="FILE", help="tuning to beat (default: the scene's; default.toml "
+    tuning.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
+    tuning.add_argument("--start", metavar="FILE", help="tuning to beat (default: the scene's; default.toml "
                         "beside it if that is from an earlier search)")  # fmt: skip
     tuning.add_argument("--trials", type=int, default=50, help="to add to the study (default 50)")
     tuning.add_argument("--jobs", type=int, default=1, help="processes on this machine (default 1)")
@@ -152,6 +157,23 @@ def parser() -> argparse.ArgumentParser:
     tuning.add_argument("--keep-period", action="store_true", help="the control period is given: search the rest")
     tuning.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
     tuning.add_argument(
-        "--out", type=Path, metavar="FILE", help="tuning to write (default SCENE.toml beside the scene's)"
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="tuning to write (default SCENE.toml, beside the scene's tuning if the scene is a file)",
+    )
+
+    command("models", "cli_shipped", "list_models", "List the robots, scenes and tunings that come with the package.")
+
+    copy = command(
+        "copy",
+        "cli_shipped",
+        "copy",
+        "Copy a scene that comes with the package, with its robot and tuning, into a folder, to be changed there.",
+    )
+    copy.add_argument("name", help="of a scene, or of a robot or tuning; pcr-mpc models lists them")
+    copy.add_argument("folder", type=Path, help="where to; it is made if it is not there")
+    copy.add_argument(
+        "--kind", choices=KINDS, help=f"which is meant of one name (default: the first of {', '.join(KINDS)})"
     )
     return top

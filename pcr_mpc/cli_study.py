@@ -36,6 +36,10 @@ def choose_rung(options: argparse.Namespace) -> int:
     """Run `pcr-mpc choose`."""
     scene = load_scene(options.scene)
     if options.write:
+        if "scene" in options.named:
+            raise ValueError(
+                f"--write changes no file that comes with the package: pcr-mpc copy {scene.name} FOLDER first"
+            )
         require_plant_table(options.scene)
         require_free(options.scene, force=True)
     choice = choose(scene, progress=True)
@@ -69,7 +73,10 @@ def tune_controller(options: argparse.Namespace) -> int:
     """Run `pcr-mpc tune`."""
     scene, known = to_tune(options.scene, options.start)
     folder = Path("results") / "tune" / scene.name
-    path = options.out or default_path(options.scene, scene.name)
+    # What comes with the package is left as it came.
+    path = options.out or Path(f"{scene.name}.toml")
+    if options.out is None and "scene" not in options.named:
+        path = default_path(options.scene, scene.name)
     require_free(path, force=options.overwrite)
     require_folder(folder, _TRIALS, force=options.overwrite)
     storage = options.storage or f"sqlite:///{folder / 'study.db'}"

@@ -103,6 +103,20 @@ def require_folder(folder: Path, names: Iterable[str], *, force: bool = False) -
         require_free(folder / name, force=force)
 
 
+def require_absent(paths: Iterable[Path], *, force: bool = False) -> None:
+    """As `require_free`, of files that become somebody's own: one that is there is left alone, whoever wrote it.
+
+    Raises
+    ------
+    OutputError
+        Names the file or the folder, and what to do.
+    """
+    for path in paths:
+        if path.exists() and not path.is_dir() and not force:
+            raise OutputError(f"{path}: is there already; give another folder, or --force", path=str(path))
+        require_free(path, force=force)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Where to write what is to take the place of ``path`` once it is whole; a link stays one."""

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from .catalogue import kinds_of
 from .errors import ModelError, described, number_problem
 
 _REQUIRED: Any = object()
@@ -182,7 +183,7 @@ def read_toml(path: str | Path) -> Table:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
-        raise ModelError(f"{path}: no such file", file=str(path)) from None
+        raise ModelError(f"{path}: no such file{_at_hand(path)}", file=str(path)) from None
     except OSError as error:
         raise ModelError(described(error) if error.filename else f"{path}: {error}", file=str(path)) from error
     # ValueError: not TOML, or an integer of thousands of digits; RecursionError: thousands of brackets.
@@ -191,3 +192,14 @@ def read_toml(path: str | Path) -> Table:
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{path}: {error}", file=str(path)) from error
     return Table(path, "", data)
+
+
+def _at_hand(path: Path) -> str:
+    """Advice to whom a file is missing that comes with the package, and may be meant."""
+    if not (kinds := kinds_of(path.stem)):
+        return ""
+    kind = kinds[0] if len(kinds) == 1 else " and a ".join(kinds)
+    return (
+        f"; a {kind} of that name comes with the package: on the command line give {path.stem}, without folder and "
+        f'".toml", in Python shipped("{path.stem}", "{kinds[0]}")'
+    )
