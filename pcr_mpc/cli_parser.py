@@ -80,8 +80,8 @@ def parser() -> argparse.ArgumentParser:
     )
     track.add_argument("scene", help="scene: a file, or a name such as lemniscate of pcr-mpc models")
     track.add_argument("--controller", type=tuning_or_class, metavar="FILE|NAME|MODULE:CLASS",
-                       help="tuning instead of the scene's own: a file, or a name of pcr-mpc models; or a controller of "
-                       "your own, such as mine:Mine for class Mine in mine.py")  # fmt: skip
+                       help="tuning instead of the scene's own: a file, or a name of pcr-mpc models; or a controller "
+                       "of your own, such as mine:Mine for class Mine in mine.py")  # fmt: skip
     track.add_argument("--method", choices=METHODS, help="statics of the plant instead of the scene's own")
     track.add_argument("--plant", choices=("mujoco",), help="simulate the robot with MuJoCo instead (extra 'mujoco')")
     track.add_argument("--links", type=int, help="of each rod, with --plant mujoco (default 40)")
