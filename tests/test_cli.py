@@ -131,4 +131,4 @@ def test_failures_are_one_clear_line(arguments, message, capsys):
 def test_help_teaches(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
-    assert "pcr-mpc track models/scenes/lemniscate.toml" in capsys.readouterr().out
+    assert "pcr-mpc track lemniscate" in capsys.readouterr().out
