@@ -117,6 +117,10 @@ def test_the_scene_doubles_the_mass_at_rest(scene):
     assert payload.mass == robot.tip_mass
     times = np.array([0.0, payload.pick - 1e-3, payload.pick, payload.place - 1e-3, payload.place, 9.0])
     assert scene.carried(times).tolist() == [0.0, 0.0, LOAD, LOAD, 0.0, 0.0]
+    # Sums of steps, whatever they are measured in: 3 * 0.1 is more than 0.3, and 7 * 0.1 is too.
+    for unit in (1e-10, 1.0, 1e5):
+        carried = Payload(LOAD, unit * 0.3, unit * 0.7).carried(unit * 0.1 * np.arange(10))
+        assert carried.tolist() == [0.0] * 3 + [LOAD] * 4 + [0.0] * 3
     assert scene.trajectory(np.array([payload.pick, payload.place]))[:, 1] == pytest.approx(np.zeros((2, 2)))
 
 

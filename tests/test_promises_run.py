@@ -56,6 +56,21 @@ def test_each_limit_is_one_of_both_signs_and_of_each_motor(run, sign, motor):
     assert commanded(run, -away * 2, at=near).limit_violations() == 0
 
 
+def test_limits_of_a_slow_motor_are_as_sharp(run):
+    """A turn in a month: rounding is of the limit, not of a rad/s."""
+    rate = 2e-6
+    slow = replace(run.scene.robot, rate_limit=rate, acceleration_limit=50.0 * rate)  # half of it in a period
+    run = replace(run, scene=replace(run.scene, robot=slow))
+    ramp = np.outer([0.0, 0.5, 1.0, 1.0, 0.5, 0.0], [rate, 0.0])
+    assert commanded(run, ramp).limit_violations() == 0
+    assert commanded(run, (1 + 1e-12) * ramp).limit_violations() == 0
+    assert (
+        commanded(run, 1.00001 * ramp).limit_violations() == 5
+    )  # four changes, of them one to full rate, and full rate
+    ramp[2:4] *= 1.00001
+    assert commanded(run, ramp).limit_violations() == 3
+
+
 def test_a_delayed_command_counts_from_where_it_arrives(run):
     """At its stop from period 2 on: the command of period 1 arrives there with a delay of one, and not without."""
     x, u = run.x.copy(), np.zeros((PERIODS, 2))

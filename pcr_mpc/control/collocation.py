@@ -10,7 +10,7 @@ import numpy as np
 
 from ..buffered import building
 from ..frozen import Frozen
-from .tuning import Limits, Tuning
+from .tuning import Limits, Tuning, time_unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,8 @@ class Transcription(Frozen):
 
     The unknowns are, period after period, one row of [u (n), (acceleration (2), z (2n)) at each Gauss point, state
     at the end (4 + n)]; the constraints one row of [(acceleration (2), statics (2n)) at each Gauss point, state at the
-    end (4 + n), change of rate (n)], all of them equations except the last n.
+    end (4 + n), change of rate (n)], all of them equations except the last n. Both are counted in the problem's own
+    units of length and time, lest a tolerance mean something else on a smaller robot; the parameters are in SI units.
 
     Attributes
     ----------
@@ -34,6 +35,8 @@ class Transcription(Frozen):
         Bounds of the constraints.
     nodes : ndarray, shape (s,)
         Gauss points in (0, 1).
+    units : ndarray, shape (width,)
+        Of the unknowns, in SI units.
     """
 
     problem: dict[str, Any]
@@ -43,6 +46,7 @@ class Transcription(Frozen):
     g_lower: np.ndarray
     g_upper: np.ndarray
     nodes: np.ndarray
+    units: np.ndarray
 
 
 def gauss_tableau(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -54,7 +58,9 @@ def gauss_tableau(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @building
-def transcribe(dynamics: Any, tuning: Tuning, limits: Limits, dt: float, points: int) -> Transcription:
+def transcribe(
+    dynamics: Any, tuning: Tuning, limits: Limits, dt: float, points: int, length: float = 1.0
+) -> Transcription:
     """Write the MPC problem of `build_qp` for nonlinear dynamics.
 
     The unknowns of the collocation are the accelerations at its points, of which positions and velocities are
@@ -71,6 +77,8 @@ def transcribe(dynamics: Any, tuning: Tuning, limits: Limits, dt: float, points:
         Control period [s].
     points : int
         Gauss points in a period, s; the order is 2s.
+    length : float
+        Unit of lengths [m]; the unit of time is that of `time_unit`.
     """
     n, n_z = dynamics.size1_in("q"), dynamics.size1_in("z")
     n_states, horizon = 4 + n, tuning.horizon
@@ -105,9 +113,17 @@ def transcribe(dynamics: Any, tuning: Tuning, limits: Limits, dt: float, points:
 
     w, g = ca.vertcat(*unknowns), ca.vertcat(*constraints)
     p = ca.vertcat(x0, f_ext, previous, ca.vec(states), ca.vec(inputs), ca.vec(terminal))
+    time = time_unit(dt)
+    of_state = np.concatenate([np.full(2, length), np.full(2, length / time), np.ones(n)])
+    of_point, of_rates = np.concatenate([np.full(2, length / time**2), np.ones(n_z)]), np.full(n, 1.0 / time)
+    units = np.concatenate([of_rates, *[of_point] * points, of_state])
+    g_units = np.concatenate([*[of_point] * points, of_state, of_rates])
+    si = ca.Function("si", [w, p], [cost, g, ca.sum1(ca.vertcat(*unstable))])
+    w = ca.SX.sym("w", w.numel())
+    cost, g, count = si(np.tile(units, horizon) * w, p)
+    g = g / np.tile(g_units, horizon)
     multipliers = ca.SX.sym("multipliers", g.numel())
     slope = ca.gradient(cost + ca.dot(multipliers, g), w)
-    count = ca.sum1(ca.vertcat(*unstable))
     free = np.full(points * (2 + n_z), np.inf)
     fixed, change = np.zeros(points * (2 + n_z) + n_states), np.full(n, limits.rate_change)
     lower = np.concatenate([np.full(n, -limits.rate), -free, np.full(4, -np.inf), limits.angle_lower])
@@ -115,9 +131,10 @@ def transcribe(dynamics: Any, tuning: Tuning, limits: Limits, dt: float, points:
     return Transcription(
         problem={"x": w, "p": p, "f": cost, "g": g},
         verdict=ca.Function("verdict", [w, p, multipliers], [g, slope, count]),
-        lower=np.tile(lower, (horizon, 1)),
-        upper=np.tile(upper, (horizon, 1)),
-        g_lower=np.tile(np.concatenate([fixed, -change]), (horizon, 1)),
-        g_upper=np.tile(np.concatenate([fixed, change]), (horizon, 1)),
+        lower=np.tile(lower / units, (horizon, 1)),
+        upper=np.tile(upper / units, (horizon, 1)),
+        g_lower=np.tile(np.concatenate([fixed, -change]) / g_units, (horizon, 1)),
+        g_upper=np.tile(np.concatenate([fixed, change]) / g_units, (horizon, 1)),
         nodes=nodes,
+        units=units,
     )

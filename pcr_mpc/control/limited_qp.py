@@ -18,9 +18,9 @@ from .qp import QuadraticProgram, constraint_matrix
 from .qp_solver import CheckedQP, Solution
 from .tuning import Tuning
 
-# Price of a limit that gives way by a radian, over the cost of the tip's way per radian. The penalty is exact while it
-# exceeds every multiplier, and those are what a limit costs in tracking: 15 is a detour of 7.5 such ways for a period.
-_PENALTY = 15.4
+# Price of a row that gives way by its own length, over the cost of the tip's way per radian. The penalty is exact while
+# it exceeds every multiplier, and those are what a limit costs in tracking.
+_PENALTY = 0.154
 _TOLERANCE = 10.0  # times the tuning's: the rows are scaled, and the inputs still right to 0.01 rad/s
 _SLACK_SEEN = 1e-4  # rad or units of a row: less is the solver's tolerance
 
@@ -80,8 +80,7 @@ class LimitedQP:
         self._horizon, self._n, self._dt, self._size = horizon, n, dt, size
         self._kinds = kinds
         self._motor_rows = np.asfortranarray(constraint_matrix(horizon, n).toarray())
-        # Slacks are those of the rows, over dt.
-        self._penalty = _PENALTY * tuning.position_weight * reach**2 * dt
+        self._penalty = _PENALTY * tuning.position_weight * reach**2
         self._groups = np.array(
             [kind for kind in ("rate", "rate change", "angle") for _ in range(size)] + [*kinds] * horizon
         )

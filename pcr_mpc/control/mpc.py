@@ -18,7 +18,7 @@ from ..linearisation.linear_model import LinearModel, LinearModels
 from .condensing import condensing
 from .plan import Plan
 from .qp import QuadraticProgram, Reference, assemble, model_sequence
-from .tuning import Limits, Tuning
+from .tuning import Limits, Tuning, time_unit
 from .workspace import Workspace
 
 _NOT_OF_THE_PROBLEM = ("name", "fallback", "model", "observer", "pd", "period")  # fields of a tuning
@@ -238,7 +238,7 @@ class LinearMPC:
         if self._problem is None:
             return True
         before, last_hessian, last_gradient = self._problem
-        slight = _SLIGHT * hessian * (limits.rate if limits.rate < np.inf else 1.0)
+        slight = _SLIGHT * hessian * (limits.rate if limits.rate < np.inf else 1.0 / time_unit(self._dt))
         return (
             limits is before
             and hessian <= _JUMP * last_hessian <= _JUMP**2 * hessian

@@ -12,8 +12,7 @@ from ..buffered import BUILDING
 from ..errors import InfeasibleError
 from .collocation import Transcription
 
-# Of every solution, recomputed from the NLP: equations in [m/s^2], tips of rods over L, [m], [m/s] and [rad], bounds
-# in [rad/s] and [rad].
+# Of every solution, recomputed from the NLP, in its own units.
 LARGEST_RESIDUAL = 1e-7
 _IPOPT = {
     "print_level": 0,
@@ -23,7 +22,7 @@ _IPOPT = {
     "acceptable_iter": 0,
     # Limits are hard: by default they would give by 1e-8.
     "bound_relax_factor": 0.0,
-    # The unknowns are of order one in SI units.
+    # The unknowns are of order one in the transcription's units.
     "nlp_scaling_method": "none",
     "warm_start_init_point": "yes",
     "warm_start_bound_push": 1e-6,

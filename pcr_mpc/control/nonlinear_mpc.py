@@ -101,7 +101,8 @@ class NonlinearMPC:
         self._terminal_weight, self._prepared = terminal_weight(model, self.tuning), model
         if self._nlp is None:
             self._dt = model.dt
-            self._nlp = transcribe(self._dynamics, self.tuning, self.limits, model.dt, self._points)
+            self._nlp = transcribe(self._dynamics, self.tuning, self.limits, model.dt, self._points, model.reach)
+            self._units = self._nlp.units
             self._solver = NLPSolver(self._nlp, self._max_iterations)
 
     def solve(
@@ -171,7 +172,7 @@ class NonlinearMPC:
             status = first.status if isinstance(first, InfeasibleError) else f"no start: {first}"
             return self.fall_back(status, x, reference, u_previous)
         self._point, self._age = solution.point, 0
-        rows = solution.point.unknowns
+        rows = self._units * solution.point.unknowns
         inputs, predicted = rows[:, :n].copy(), np.vstack([x, rows[:, -n_states:]])
         inputs[0] = self.limits.kept(inputs[0], u_previous, x[4:], self._dt)
         agreeing = replace(model, c=model.c + predicted[1] - model(x, inputs[0]))
@@ -262,4 +263,4 @@ class NonlinearMPC:
         acceleration = np.repeat(np.diff(ends[:, 2:4], axis=0)[:, None] / self._dt, self._points, axis=1)
         at_points = np.concatenate([acceleration, z], axis=2).reshape(horizon, -1)
         unknowns = np.hstack([reference.inputs, at_points, reference.states])
-        return Point(unknowns, np.zeros_like(unknowns), np.zeros_like(self._nlp.g_lower))
+        return Point(unknowns / self._units, np.zeros_like(unknowns), np.zeros_like(self._nlp.g_lower))

@@ -25,6 +25,7 @@ INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
 # Two sums of the same commands differ by rounding [rad].
 SAME_ANGLE = 1e-9
+_MET = 1e-12  # of the limit on the change of rate, by which a change that meets it may be less
 # Matrices grow with the square of the horizon: at this one they are made in half a minute.
 LONGEST_HORIZON = 400
 SOLVERS = ("osqp", "daqp")
@@ -86,7 +87,8 @@ class Tuning:
     input_weight : float
         On deviations of the motor rates from the feed-forward [1/(rad/s)^2].
     tolerance : float
-        Of the QP's solver, absolute and relative; OSQP's absolute one is of rates [rad/s].
+        Of the QP's solver, absolute and relative; the absolute one is of angles turned in a hundred periods [rad],
+        which at 10 ms are rates in rad/s.
     max_iterations : int
         After which the solver gives up.
     fallback : {"ladder", "raise"}
@@ -136,6 +138,15 @@ class Tuning:
         object.__setattr__(self, "pd", tuple(checked_vector("pd", self.pd, 2).tolist()))
         if self.period is not None:
             object.__setattr__(self, "period", checked_number("period", self.period, above=0.0))
+
+
+def time_unit(dt: float) -> float:
+    """Unit of time of a problem with control period dt, a hundred periods [s].
+
+    What a solver is handed, and its tolerances, are counted in it, lest they mean something else where everything is
+    quicker. At 10 ms it is a second.
+    """
+    return 100.0 * dt
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -240,7 +251,7 @@ class Limits(Frozen):
 
     def met_by(self, u: np.ndarray, u_previous: np.ndarray) -> tuple[str, ...]:
         """Which limits the clipped rates u meet: on the rate, on its change, or else on an angle."""
-        met = {"rate": np.abs(u) >= self.rate, "rate change": np.abs(u - u_previous) >= self.rate_change - 1e-12}
+        met = {"rate": np.abs(u) >= self.rate, "rate change": np.abs(u - u_previous) >= self.rate_change * (1 - _MET)}
         return tuple(kind for kind, where in met.items() if where.any()) or ("angle",)
 
 

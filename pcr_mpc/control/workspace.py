@@ -18,7 +18,7 @@ from .limited_qp import Limited, LimitedQP, active_of
 from .osqp_solver import QPSolver
 from .qp import QuadraticProgram, constraint_matrix, motor_bounds
 from .qp_solver import Solution
-from .tuning import Limits, Tuning
+from .tuning import Limits, Tuning, time_unit
 
 _RATES = ("rate", "rate change")
 _FEWEST_ITERATIONS = 10  # with which a solver is tried at all
@@ -39,6 +39,7 @@ class Workspace:
         self._tuning = tuning
         rates = constraint_matrix(tuning.horizon, self.n)[: 2 * tuning.horizon * self.n].tocsc()
         solver = DAQPSolver if tuning.solver == "daqp" else QPSolver
+        self._rate = 1.0 / time_unit(self.dt)  # unit of the rates that the solver sees
         self._rates_only = solver(rates, tuning.tolerance, tuning.max_iterations)
         self._limited: dict[tuple[str, ...], LimitedQP] = {}
         self._limits_matter = False  # in the last plan, beside those on the rates
@@ -83,25 +84,28 @@ class Workspace:
         """
         self._spent, self._inside = 0, 0.0
         if not self._limits_matter:
-            n_rates = self._rates_only.m
+            n_rates, rate = self._rates_only.m, self._rate
             try:
-                self._rates_only.update(qp.P, qp.q, qp.l[:n_rates], qp.u[:n_rates], sound=qp.sizes[2] > 0.0)
+                lower, upper = qp.l[:n_rates] / rate, qp.u[:n_rates] / rate
+                self._rates_only.update(rate**2 * qp.P, rate * qp.q, lower, upper, sound=qp.sizes[2] > 0.0)
                 if warm is not None:
-                    self._rates_only.warm_start(warm)
-                solution = self._rates_only.solve(certified=False)
+                    self._rates_only.warm_start(warm / rate)
+                found = self._rates_only.solve(certified=False)
             except InfeasibleError as error:
                 self._count(error)
             else:
-                states, primal, dual, broken, *pulls = self.check(x, models, solution, qp, limits)
-                solution = Solution(solution.x, solution.y, solution.iterations, solution.run_time, primal, dual)
+                inputs, y = rate * found.x, found.y / rate
+                states, primal, dual, broken, *pulls = self.check(x, models, inputs, y, qp, limits)
+                solution = Solution(inputs, y, found.iterations, found.run_time, primal / rate, rate * dual)
                 if pose_limits is not None:
                     rows = states[1:] @ pose_limits.C.T
                     broken = max(
                         broken, float((pose_limits.lower - rows).max()), float((rows - pose_limits.upper).max())
                     )
-                if broken <= self._tuning.tolerance * self.dt:
-                    return Limited(solution.x, states, {}, active_of(dict(zip(_RATES, pulls, strict=True))), solution)
-                self._spent, self._inside, warm = solution.iterations, solution.run_time, solution.x
+                if broken <= self._tuning.tolerance * self._rate * self.dt:
+                    active = active_of({kind: rate * pull for kind, pull in zip(_RATES, pulls, strict=True)})
+                    return Limited(inputs, states, {}, active, solution)
+                self._spent, self._inside, warm = solution.iterations, solution.run_time, inputs
         return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
 
     def soften(
@@ -161,17 +165,18 @@ class Check:
         self._limits: Limits | None = None
 
     def __call__(
-        self, x: np.ndarray, models: LinearModels, solution: Solution, qp: QuadraticProgram, limits: Limits
-    ) -> tuple[Any, ...]:
+        self, x: np.ndarray, models: LinearModels, inputs: np.ndarray, multipliers: np.ndarray, qp: QuadraticProgram,
+        limits: Limits,
+    ) -> tuple[Any, ...]:  # fmt: skip
         """States, shape (N + 1, 4 + n), residuals of rows and gradient, excess of an angle [rad], and the
         largest multipliers of rates and of changes."""
         graph = self._graph(len(models))
         _, _, _, y, p, q, lower, upper, bounds, _ = graph.inputs
-        y[:], p[:], q[:], lower[:], upper[:] = solution.y, qp.P, qp.q, qp.l, qp.u
+        y[:], p[:], q[:], lower[:], upper[:] = multipliers, qp.P, qp.q, qp.l, qp.u
         if limits is not self._limits:
             self._limits, self._bounds = limits, motor_bounds(limits)
         bounds[:] = self._bounds
-        states = self.states(x, models, solution.x)
+        states = self.states(x, models, inputs)
         return states, *graph.outputs[1].tolist()
 
     def states(self, x: np.ndarray, models: LinearModels, inputs: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from .record import ARRAYS, FORMAT, from_text, record, write_csv
 from .scene import Scene
 from .settings import PlantSettings
 
-# Commands within this of a limit keep it: rounding for rates, the QP's tolerance for angles.
+# Commands within this of a limit keep it: rounding for rates, relative to it, the QP's tolerance for angles [rad].
 _LIMIT_SLACK = 1e-9
 _ANGLE_SLACK = 1e-5
 # Of a limit on poses, relative to it: the controller keeps them to its solver's tolerance.
@@ -141,8 +141,8 @@ class Run(Frozen):
         starts = self.x[self.scene.delay * self.steps_per_period :: self.steps_per_period, 4:][: len(self.u)]
         angles = starts + period * self.u[: len(starts)]
         lower, upper = robot.angle_limits.T
-        broken = np.abs(self.u).max(axis=1, initial=0.0) > robot.rate_limit + _LIMIT_SLACK
-        broken |= np.abs(change).max(axis=1, initial=0.0) > robot.acceleration_limit * period + _LIMIT_SLACK
+        broken = np.abs(self.u).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.rate_limit
+        broken |= np.abs(change).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.acceleration_limit * period
         # Coming back from beyond a stop breaks nothing.
         outside = (angles < lower - _ANGLE_SLACK) & (angles <= starts) | (angles > upper + _ANGLE_SLACK) & (
             angles >= starts

@@ -18,7 +18,7 @@ from ..toml_table import Table
 
 RODS = ("plain", "as_built")
 PAYLOADS = ("ignored", "carried")
-_SAME_TIME = 1e-9  # s
+_EARLY = 1 - 1e-9  # of a time: what is no earlier comes at that time
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Payload:
     def carried(self, t: np.ndarray) -> np.ndarray:
         """Mass that the tip carries from the times t on [kg], same shape."""
         # Times are sums of steps: rounding must not decide.
-        return np.where((t > self.pick - _SAME_TIME) & (t < self.place - _SAME_TIME), self.mass, 0.0)
+        return np.where((t >= _EARLY * self.pick) & (t < _EARLY * self.place), self.mass, 0.0)
 
 
 def read_plant(table: Table, robot: Robot) -> PlantSettings:
