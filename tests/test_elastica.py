@@ -9,6 +9,7 @@ from pcr_mpc import solve_statics
 from pcr_mpc.plant.rods import elastica
 from pcr_mpc.plant.rods.chart import held_shapes
 from pcr_mpc.plant.rods.equations import sample_rod
+from pcr_mpc.plant.rods.pendulum import swing_with_slopes
 
 from .conftest import DATA
 
@@ -41,6 +42,23 @@ def test_pendulum_against_mpmath(pendulum, log_tip_angle, u):
     found = [float(value) for value in pendulum(log_tip_angle, u)]
     found[0] = exact[0] + np.angle(np.exp(1j * (found[0] - exact[0])))
     assert found == pytest.approx(exact, abs=1e-14, rel=2e-13)
+
+
+@pytest.mark.parametrize(
+    ("log_tip_angle", "u"), [(1.14, 2.0), (1.1, 5.9), (0.0, 2.0), (-2.0, 0.1), (-20.0, 21.0), (-250.0, 249.0)]
+)
+def test_slopes_of_the_pendulum_against_mpmath(log_tip_angle, u):
+    symbols = ca.SX.sym("l"), ca.SX.sym("u")
+    found = ca.Function("slopes", symbols, [swing_with_slopes(*symbols)[1]])(log_tip_angle, u).full()
+    with mpmath.workdps(400):
+        step = mpmath.mpf(10) ** -150
+
+        def slope(*by):
+            ends = (by_mpmath(log_tip_angle + s * by[0], u + s * by[1]) for s in (step, -step))
+            return [float((ahead - behind) / (2 * step)) for ahead, behind in zip(*ends, strict=True)]
+
+        exact = np.array([slope(1, 0), slope(0, 1)]).T
+    assert found == pytest.approx(exact, rel=2e-12, abs=1e-13 * np.abs(exact).max())
 
 
 def test_pendulum_against_its_equation(pendulum):

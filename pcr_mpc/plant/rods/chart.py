@@ -23,6 +23,7 @@ from scipy.optimize import brentq
 from ...buffered import BufferedFunction, per_thread
 from . import elastica
 from .nearly_straight import nearly_straight
+from .pendulum import beyond_numbers
 
 LEAST_CRITICAL_LOAD = 5.7659  # of all rods, at k = 0.9427
 _MAX_LOAD = 600.0  # largest lambda on the sheet, about
@@ -113,7 +114,7 @@ def critical_load(log_tip_angle: float) -> float:
     if log_tip_angle < _LOOPED:
         # A full loop is about to leave a taut rod, a little short of 2 K(k).
         full_loop = 2.0 * (np.log(8.0) - log_tip_angle)
-        if elastica.beyond_numbers(log_tip_angle - np.log(2.0)):
+        if beyond_numbers(log_tip_angle - np.log(2.0)):
             return float(full_loop - 0.55)
         return float(brentq(determinant, full_loop - 0.8, full_loop - 0.3, xtol=1e-10))
     guess = rough_critical_load(log_tip_angle)

@@ -13,7 +13,6 @@ iteration per rod. The logarithm is the variable because a taut rod has tip_angl
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import casadi as ca
@@ -21,11 +20,8 @@ import numpy as np
 
 from ...buffered import graph_cache
 from .equations import sample_rod
+from .pendulum import Swing, beyond_numbers, pendulum, swing, swing_with_slopes
 
-# Ascending Landen steps: k' falls below 1e-16 from any k >= 1e-6.
-_LANDEN_STEPS = 8
-# Logarithm of the smallest k' of which powers are taken, and of the unit that then takes its place, over k'.
-_SMALLEST, _SHIFT = -100.0, 60.0
 _COARSE = 100.0  # load from which residuals are weighed down
 _SWEEP = 60  # points along the rod at which conjugate points are looked for
 _GENTLE = 2.0  # load below which steps are taken in the components of the force
@@ -35,66 +31,14 @@ TAUT = 8.0  # load from which a stable rod is taut: its tip is straight to exp(-
 _ROUNDING = 1e-5
 
 
-def elliptic(
-    u: Any, k: Any, k_prime: Any, steps: int = _LANDEN_STEPS, log_k_prime: Any = None
-) -> tuple[Any, Any, Any, Any]:
-    """Sn, cn, dn and D = k'^2 int nd^2 du by ascending Landen transformations, with a fixed number of operations.
-
-    The modulus is driven to 1, where the functions are hyperbolic and D = 0, so that k' may be as small as it
-    likes (DLMF 22.7.6-8; k and k' are both arguments, for neither may come from the other). With
-    D = E(am u) - k^2 sn cd, DLMF 19.8.13 becomes a sum of positive terms: nothing cancels.
-
-    With the logarithm of k' too, cn and dn are given in units of k' exp(_SHIFT) where k' is `beyond_numbers`, for there
-    neither it nor they are floating-point numbers, and what is wanted are their ratios.
-    """
-    moduli, factor = [], ca.SX(1)
-    for _ in range(steps):
-        moduli.append((k, k_prime, k_prime))
-        factor *= (1 + k) / 2
-        k, k_prime = 2 * ca.sqrt(k) / (1 + k), (k_prime / (1 + k)) ** 2
-    u = u_shifted = u * factor
-    if log_k_prime is not None:
-        # As cosh(x) is exp(x)/2, cosh(u) k' exp(_SHIFT) is cosh of the sum, but near the tip, where all is straight.
-        tiny = beyond_numbers(log_k_prime)
-        u_shifted = ca.if_else(tiny, ca.fmax(u + log_k_prime + _SHIFT, 0), u)
-        moduli[0] = *moduli[0][:2], ca.if_else(tiny, math.exp(-_SHIFT), moduli[0][1])
-    sn, dn = ca.tanh(u), 1 / ca.cosh(u_shifted)
-    cn, d = dn, ca.SX(0)
-    for k, k_prime, in_its_unit in reversed(moduli):
-        up = (in_its_unit / (1 + k)) ** 2  # complementary modulus one step up
-        ratio = up / dn
-        sn, cn, dn = 2 / (1 + k) * sn * cn / dn, (1 + k) / (2 * k) * (dn - ratio), (1 + k) / 2 * (dn + ratio)
-        d = (1 + k) * d + k_prime**2 / (1 + k) * u + k * sn * (1 - k * cn / dn)
-        u = u * 2 / (1 + k)
-    return sn, cn, dn, d
+def _tip(found: Swing, load: Any) -> Any:
+    """Tip seen from the clamp, of a left-handed rod."""
+    along, across = found.cos * found.c + found.sin * found.rate, found.sin * found.c - found.cos * found.rate
+    return ca.vertcat(along, across) / load
 
 
-def beyond_numbers(log_k_prime: Any) -> Any:
-    """Whether k' is too small for its powers to be floating-point numbers, by its logarithm."""
-    return log_k_prime < _SMALLEST
-
-
-def pendulum(log_tip_angle: Any, u: Any, *, any_pull: bool = False) -> tuple[Any, Any, Any]:
-    """Angle delta, its rate d delta/du and int cos(delta) du at u.
-
-    Right up to log(tip_angle) = -300, and beyond with ``any_pull``, which costs more.
-    """
-    half, log_half = ca.exp(log_tip_angle) / 2, log_tip_angle - np.log(2.0)
-    k, k_prime = ca.cos(half), ca.sin(half)
-    sn, cn, dn, d = elliptic(u, k, k_prime, log_k_prime=log_half if any_pull else None)
-    if any_pull:
-        k_prime = ca.if_else(beyond_numbers(log_half), math.exp(-_SHIFT), k_prime)
-    delta = 2 * ca.atan2(k_prime / dn, k * cn / dn)
-    return delta, 2 * k * sn * (k_prime / dn), u - 2 * d
-
-
-def _tip(log_tip_angle: Any, load: Any, *, any_pull: bool = False) -> tuple[Any, Any, Any, Any]:
-    """Tip seen from the clamp (left-handed rod), delta and rate at the base, energy."""
-    delta, rate, c = pendulum(log_tip_angle, load, any_pull=any_pull)
-    cos, sin = ca.cos(delta), ca.sin(delta)
-    # The rate is also int sin(delta) du.
-    tip = ca.vertcat(cos * c + sin * rate, sin * c - cos * rate) / load
-    return tip, delta, rate, load**2 * ca.cos(ca.exp(log_tip_angle)) - load * c
+def _energy(log_tip_angle: Any, found: Swing, load: Any) -> Any:
+    return load**2 * ca.cos(ca.exp(log_tip_angle)) - load * found.c
 
 
 def beyond_limit(determinant: Any, unknowns: Any) -> Any:
@@ -108,7 +52,8 @@ def beyond_limit(determinant: Any, unknowns: Any) -> Any:
 def tip_map() -> Any:
     """Graph [log tip_angle, lambda] -> tip (2), its Jacobian (2, 2), energy, for a left-handed rod."""
     unknowns = ca.SX.sym("unknowns", 2)
-    tip, _, _, energy = _tip(unknowns[0], unknowns[1], any_pull=True)
+    found, _ = swing(unknowns[0], unknowns[1], any_pull=True)
+    tip, energy = _tip(found, unknowns[1]), _energy(unknowns[0], found, unknowns[1])
     return ca.Function("tip_map", [unknowns], [tip, ca.jacobian(tip, unknowns), energy], {"cse": True})
 
 
@@ -121,17 +66,25 @@ def rod_newton(*, any_pull: bool = False) -> tuple[Any, Any]:
     """
     unknowns, pose = ca.SX.sym("unknowns", 3), ca.SX.sym("pose", 3)
     load, hand = unknowns[1], unknowns[2]
-    tip, delta, rate, energy = _tip(unknowns[0], load, any_pull=any_pull)
+    if any_pull:
+        found, _ = swing(unknowns[0], load, any_pull=True)
+        slopes = ca.jacobian(ca.vertcat(*pendulum(unknowns[0], load, any_pull=True)), unknowns[:2])
+    else:
+        found, slopes = swing_with_slopes(unknowns[0], load)
+    tip, energy = _tip(found, load), _energy(unknowns[0], found, load)
+    cos, sin = ca.cos(pose[2]), ca.sin(pose[2])
     # The target is seen from the clamp, mirrored for the right hand.
-    turn = ca.vertcat(
-        ca.horzcat(ca.cos(pose[2]), ca.sin(pose[2])), hand * ca.horzcat(-ca.sin(pose[2]), ca.cos(pose[2]))
-    )
-    target = turn @ pose[:2]
-    psi = pose[2] + hand * delta
-    loads = ca.vertcat(load**2 * ca.cos(psi), load**2 * ca.sin(psi), hand * load * rate)
+    target = ca.vertcat(ca.horzcat(cos, sin), hand * ca.horzcat(-sin, cos)) @ pose[:2]
+    # The force is at the angle psi = pose[2] + hand delta.
+    force = load**2 * ca.vertcat(cos * found.cos - hand * sin * found.sin, sin * found.cos + hand * cos * found.sin)
+    loads = ca.vertcat(force, hand * load * found.rate)
 
     residual = tip - target
-    jacobian = ca.jacobian(tip, unknowns[:2])
+    quarter = ca.DM([[0, -1], [1, 0]])  # turn
+    outward = ca.vertcat(ca.horzcat(found.cos, found.sin), ca.horzcat(found.sin, -found.cos))
+    jacobian = quarter @ tip @ slopes[0, :] + ca.horzcat(
+        outward @ ca.vertcat(slopes[2, 0], slopes[1, 0]), ca.DM([1, 0]) - tip
+    ) / load  # fmt: skip
     determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
     inverse = ca.vertcat(
         ca.horzcat(jacobian[1, 1], -jacobian[0, 1]), ca.horzcat(-jacobian[1, 0], jacobian[0, 0])
@@ -139,7 +92,11 @@ def rod_newton(*, any_pull: bool = False) -> tuple[Any, Any]:
     step = -(inverse @ residual)
     # Implicit function theorem: the unknowns follow the target.
     moves = inverse @ ca.jacobian(target, pose)
-    load_moves = ca.jacobian(loads, unknowns[:2]) @ moves + ca.jacobian(loads, pose)
+    psi_moves = hand * slopes[0, :] @ moves + ca.DM([[0, 0, 1]])
+    load_moves = ca.vertcat(
+        quarter @ force @ psi_moves + 2 / load * force @ moves[1, :],
+        hand * (load * slopes[1, :] @ moves + found.rate * moves[1, :]),
+    )
     norm = ca.norm_2(residual)
     if any_pull:
         # The last digit of log tip_angle turns a taut rod by more than the last digit of its tip.
@@ -159,7 +116,7 @@ def rod_chord() -> Any:
     """
     unknowns, pose, tangent = ca.SX.sym("unknowns", 3), ca.SX.sym("pose", 3), ca.SX.sym("tangent", 3, 3)
     hand = unknowns[2]
-    tip = _tip(unknowns[0], unknowns[1])[0]
+    tip = _tip(swing(unknowns[0], unknowns[1], any_pull=False)[0], unknowns[1])
     cos, sin = ca.cos(pose[2]), ca.sin(pose[2])
     reached = ca.vertcat(cos * tip[0] - sin * hand * tip[1], sin * tip[0] + cos * hand * tip[1])
     return ca.Function("rod_chord", [unknowns, pose, tangent], [tangent[:, :2] @ (pose[:2] - reached)], {"cse": True})

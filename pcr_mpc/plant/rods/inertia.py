@@ -23,7 +23,7 @@ import numpy as np
 from scipy.special import roots_jacobi
 
 from ...buffered import graph_cache
-from .elastica import elliptic
+from .pendulum import elliptic
 
 INERTIAS = ("none", "constant", "condensed", "full")
 # Points along a rod, beside the tip: 1e-5 of its inertia (1e-3 of the smallest entries) where rods are bent like those

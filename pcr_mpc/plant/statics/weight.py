@@ -19,8 +19,8 @@ import numpy as np
 
 from ...buffered import BufferedFunction, graph_cache
 from ..robot import Robot
-from ..rods.elastica import pendulum
 from ..rods.numbers import Kind
+from ..rods.pendulum import pendulum
 from .equilibrium import Equilibrium
 
 WEIGHTS = ("none", "condensed", "exact")
