@@ -28,11 +28,15 @@ if TYPE_CHECKING:
     from .linearisation.linearise import linearise
     from .loop.controllers import Controller, Decision, HoldMotors
     from .loop.feasibility import check_scene
+    from .loop.references.blended import Blended
+    from .loop.references.on_curves import Circle, Line, Polygon, Spline, Waypoints
+    from .loop.references.path_file import load_path
+    from .loop.references.tabulated import Tabulated
     from .loop.run import Run, load_run
     from .loop.scene import Scene, load_scene
     from .loop.simulate import simulate
     from .loop.tracking import TrackingController, make_controller
-    from .loop.trajectory import Trajectory
+    from .loop.trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
     from .plant.materials import MATERIALS, Material, Section
     from .plant.motion.plant import Plant
     from .plant.motion.rollout import Rollout, rollout
@@ -51,23 +55,30 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MATERIALS",
+    "Blended",
+    "Circle",
     "CompilerError",
     "Controller",
     "ConvergenceError",
     "Decision",
     "Equilibria",
     "Equilibrium",
+    "Hold",
     "HoldMotors",
     "InfeasibleError",
+    "Lemniscate",
     "Limits",
+    "Line",
     "LinearMPC",
     "LinearModel",
     "Material",
     "MeasurementError",
     "ModelError",
     "PCRError",
+    "PickAndPlace",
     "Plan",
     "Plant",
+    "Polygon",
     "QuadraticProgram",
     "Reference",
     "Robot",
@@ -78,13 +89,16 @@ __all__ = [
     "Section",
     "Sensitivities",
     "SimulationError",
+    "Spline",
     "Spread",
     "Stability",
+    "Tabulated",
     "TrackingController",
     "Trajectory",
     "Tuning",
     "UnreachableError",
     "UnstableError",
+    "Waypoints",
     "all_equilibria",
     "animate_run",
     "assess_stability",
@@ -96,6 +110,7 @@ __all__ = [
     "forward_statics",
     "inverse_statics",
     "linearise",
+    "load_path",
     "load_robot",
     "load_run",
     "load_scene",
@@ -136,11 +151,15 @@ _WHERE = {
     "linearisation.linearise": ("linearise",),
     "loop.controllers": ("Controller", "Decision", "HoldMotors"),
     "loop.feasibility": ("check_scene",),
+    "loop.references.blended": ("Blended",),
+    "loop.references.on_curves": ("Circle", "Line", "Polygon", "Spline", "Waypoints"),
+    "loop.references.path_file": ("load_path",),
+    "loop.references.tabulated": ("Tabulated",),
     "loop.run": ("Run", "load_run"),
     "loop.scene": ("Scene", "load_scene"),
     "loop.simulate": ("simulate",),
     "loop.tracking": ("TrackingController", "make_controller"),
-    "loop.trajectory": ("Trajectory",),
+    "loop.trajectory": ("Hold", "Lemniscate", "PickAndPlace", "Trajectory"),
     "plant.motion.plant": ("Plant",),
     "plant.statics.equilibria": ("Equilibria",),
     "plant.statics.equilibrium": ("Equilibrium",),

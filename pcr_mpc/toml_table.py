@@ -114,6 +114,15 @@ class Table:
             raise self.fail(key, f"expected an integer >= {minimum}, found {value!r}")
         return value
 
+    def count(self, key: str) -> float:
+        """Take an integer of at least 1, or "for ever", which is infinity."""
+        value = self._take(key, _REQUIRED)
+        if value == "for ever":
+            return math.inf
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise self.fail(key, f'expected an integer >= 1, or "for ever", found {value!r}')
+        return float(value)
+
     def boolean(self, key: str, default: bool = _REQUIRED) -> bool:
         """Take true or false."""
         value = self._take(key, default)
@@ -135,6 +144,16 @@ class Table:
             raise self.fail(key, f"expected a list of {count}finite numbers, found {value!r}")
         return tuple(float(v) for v in value)
 
+    def points(self, key: str) -> tuple[tuple[float, float], ...]:
+        """Take a list of pairs of finite numbers."""
+        value = self._take(key, _REQUIRED)
+        if not isinstance(value, list):
+            raise self.fail(key, f"expected a list of points [x, y], found {value!r}")
+        for i, point in enumerate(value):
+            if not isinstance(point, list) or len(point) != 2 or any(number_problem(v) for v in point):
+                raise self.fail(f"{key}[{i}]", f"expected two finite numbers, found {point!r}")
+        return tuple((float(x), float(y)) for x, y in value)
+
     def profile(self, key: str, default: Any = _REQUIRED) -> Any:
         """Take a finite number, or a list of them."""
         if isinstance(self._data.get(key), list):
@@ -150,6 +169,10 @@ class Table:
             expected = f"one of {', '.join(choices)}" if choices else "a string"
             raise self.fail(key, f"expected {expected}, found {value!r}")
         return value
+
+    def peek(self, key: str) -> Any:
+        """Look at a value without taking it; None if it is not there."""
+        return self._data.get(key)
 
     def has(self, key: str) -> bool:
         """Whether the key is there and not taken yet."""

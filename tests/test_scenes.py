@@ -76,7 +76,7 @@ def files(tmp_path):
         ("models/planar_pair.toml", 'name = "planar_pair"', "", "name", "missing"),
         ("models/scenes/lemniscate.toml", "period = 2.0", "priod = 2.0", "priod", "did you mean 'period'"),
         ("models/scenes/lemniscate.toml", "period = 0.01", "period = 0.0105", "period", "not a multiple"),
-        ("models/scenes/lemniscate.toml", 'kind = "lemniscate"', 'kind = "circle"', "kind", "one of"),
+        ("models/scenes/lemniscate.toml", 'kind = "lemniscate"', 'kind = "ellipse"', "kind", "one of"),
         ("models/scenes/lemniscate.toml", "tip = [0.0, 0.25]", "tip = [0.0, 0.2]", "start.tip", "not where"),
         ("models/scenes/lemniscate.toml", "duration = 6.0 ", "duration = 6.0\nspeed = 1", "speed", "unknown key"),
         ("controllers/lemniscate.toml", "horizon = 6", "horizon = 0", "horizon", "integer >= 1"),

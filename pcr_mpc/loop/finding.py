@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ..plain import plain
+from .references.reading import built_in
 from .scene import Scene
-from .trajectory import Hold, Lemniscate, PickAndPlace, sampled
+from .trajectory import sampled
 
 
 def digest(scene: Scene) -> str:
@@ -30,7 +31,7 @@ def digest(scene: Scene) -> str:
 def own_motion(scene: Scene) -> dict[str, str] | None:
     """Type and digest of the samples of a trajectory that is not the toolkit's; None: it says what it is itself."""
     trajectory = scene.trajectory
-    if trajectory is None or isinstance(trajectory, Hold | Lemniscate | PickAndPlace):
+    if trajectory is None or built_in(trajectory):
         return None
     samples = sampled(trajectory, scene.period * np.arange(scene.n_periods + 1))
     return {"type": type(trajectory).__name__, "samples": hashlib.sha256(samples.tobytes()).hexdigest()[:12]}

@@ -20,9 +20,9 @@ from ..linearisation.pose_limits import PoseLimits
 from ..plant.robot import Robot
 from ..plant.rod import Rod
 from ..plant.statics.equilibrium import Equilibrium
+from .references.reading import KINDS, built_in
 from .scene import Scene
 from .settings import Finding, Need, Payload, PlantSettings
-from .trajectory import Hold, Lemniscate, PickAndPlace
 
 # Arrays of a run, and what run.npz says of them.
 ARRAYS = {
@@ -73,8 +73,8 @@ class Recorded:
 
 
 _KINDS: tuple[type, ...] = (
-    Scene, Robot, Rod, PlantSettings, Payload, Need, Finding, PoseLimits, Tuning, Model, ObserverTuning, Hold,
-    Lemniscate, PickAndPlace, Recorded, Equilibrium,
+    Scene, Robot, Rod, PlantSettings, Payload, Need, Finding, PoseLimits, Tuning, Model, ObserverTuning, *KINDS,
+    Recorded, Equilibrium,
 )  # fmt: skip
 _BY_NAME = {kind.__name__: kind for kind in _KINDS}
 
@@ -98,7 +98,7 @@ def from_text(text: str) -> Any:
 def record(run: Any) -> dict[str, Any]:
     """Everything that a `Run` holds, as arrays and text."""
     scene, tuning = run.scene, run.tuning
-    if scene.trajectory is not None and type(scene.trajectory) not in _KINDS:
+    if scene.trajectory is not None and not (built_in(scene.trajectory) or type(scene.trajectory) is Recorded):
         # As far as a controller with this tuning looks ahead, too.
         ahead = (1 if tuning is None else tuning.horizon) + scene.delay + 1
         t = run.dt * np.arange(round((scene.duration + ahead * scene.period) / run.dt) + 1)

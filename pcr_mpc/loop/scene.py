@@ -16,9 +16,11 @@ from ..plant.robot import Robot, load_robot
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.free_tip import forward_statics, inverse_statics
 from ..toml_table import Table, read_toml
+from .references.blended import duration_of
+from .references.reading import read_reference
 from .scene_checks import LATE, check_scene, is_multiple
 from .settings import Finding, Need, Payload, PlantSettings, read_finding, read_need, read_payload, read_plant
-from .trajectory import Trajectory, read_trajectory
+from .trajectory import Trajectory
 
 # Distance of the start from the reference that is taken for the same place, in rod lengths: found, and as given.
 _START_TOLERANCE, _START_ROUNDING = 2.5e-3, 2.5e-9
@@ -222,7 +224,8 @@ def load_scene(path: str | Path) -> Scene:
     with read_toml(path) as file:
         name = file.text("name")
         robot = load_robot(file.path.parent / file.text("robot"))
-        duration = file.number("duration", above=0.0)
+        with file.table("reference") as reference:
+            trajectory = read_reference(reference)
         with file.table("limits", {}) as limits:
             own_torque = limits.has("torque")
             robot = replace(
@@ -240,12 +243,15 @@ def load_scene(path: str | Path) -> Scene:
             motors = start.vector("motors", robot.n_rods, None)
             mode = start.text("mode", None)
             velocity = start.vector("velocity", 2, (0.0, 0.0))
+            if tip is None and motors is None and mode is not None and trajectory is not None:
+                tip = tuple(trajectory(np.zeros(1))[0, 0].tolist())
             if (tip is None) == (motors is None) or (tip is None) != (mode is None):
                 raise start.fail("tip", "give either tip and mode, or motors")
         with file.table("plant") as table:
             plant = read_plant(table, robot)
         with file.table("control") as control:
             period = control.number("period", above=0.0)
+            duration = _duration(file, trajectory, period)
             tuning = control.text("tuning", None)
             delay = control.integer("delay", 0, minimum=0)
             deadline = control.number("deadline", math.inf, minimum=0.0)
@@ -257,8 +263,6 @@ def load_scene(path: str | Path) -> Scene:
             wrapped = sensor.boolean("wrapped", False)
         payload = read_payload(file)
         need, finding = read_need(file), read_finding(file)
-        with file.table("reference") as reference:
-            trajectory = read_trajectory(reference)
         scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                       tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
                       delay, deadline, late, pose_limits, payload, need, finding,
@@ -285,6 +289,13 @@ def load_scene(path: str | Path) -> Scene:
     except ModelError as error:
         raise ModelError(f"{path}: {error}", file=str(path), **error.details) from None
     return scene if scene.tuning is None else scene.tuned(scene.tuning)
+
+
+def _duration(file: Table, trajectory: Trajectory | None, period: float) -> float:
+    """As stated, or as long as the reference takes, in whole control periods."""
+    if file.has("duration") or trajectory is None or math.isinf(duration_of(trajectory)):
+        return file.number("duration", above=0.0)
+    return period * math.ceil(duration_of(trajectory) / period - 1e-9)
 
 
 def _require_within_stops(scene: Scene) -> None:

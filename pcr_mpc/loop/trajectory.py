@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from ..errors import ModelError, check_numbers, checked_array, checked_vector
-from ..toml_table import Table
 
 _POSITIVE = {"above": 0.0}
 
@@ -38,6 +38,23 @@ def smooth_step(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     slope = 30.0 * s**2 * (1.0 - s) ** 2
     curvature = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
     return value, slope, curvature
+
+
+def risen(t: np.ndarray, blend: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time [s] that passes at a rate which rises from 0 to 1 by a quintic, that rate and its change [1/s].
+
+    Parameters
+    ----------
+    t : ndarray
+        [s].
+    blend : float
+        How long it rises [s].
+    """
+    s = np.clip(t / blend, 0.0, 1.0) if blend > 0 else np.ones(len(t))
+    rate, change, _ = smooth_step(s)
+    # Integral of the quintic from 0 to s, times its duration, then constant rate.
+    own = blend * (s**4 * (2.5 - 3.0 * s + s**2)) + np.maximum(t - blend, 0.0)
+    return own, rate, change / blend if blend > 0 else np.zeros(len(t))
 
 
 @dataclass(frozen=True)
@@ -72,7 +89,7 @@ class Lemniscate:
     period : float
         [s].
     ramp : float
-        [s].
+        [s]. Zero: it moves from the start on, and its lap has a duration.
     """
 
     centre: tuple[float, float]
@@ -82,17 +99,18 @@ class Lemniscate:
 
     def __post_init__(self) -> None:
         _check_points(self, "centre", "size")
-        check_numbers(self, {"period": _POSITIVE, "ramp": _POSITIVE})
+        check_numbers(self, {"period": _POSITIVE, "ramp": {"minimum": 0.0}})
+
+    @property
+    def duration(self) -> float:
+        """Of a lap, if it is a lap; else it goes on for ever [s]."""
+        return math.inf if self.ramp else self.period
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """See `Trajectory`."""
         omega = 2.0 * np.pi / self.period
-        s = np.clip(t / self.ramp, 0.0, 1.0)
-        value, slope, _ = smooth_step(s)
-        # Integral of the quintic from 0 to s, times the ramp, then constant rate.
-        integral = s**4 * (2.5 - 3.0 * s + s**2)
-        phase = omega * (self.ramp * integral + np.maximum(t - self.ramp, 0.0))
-        rate, rate_change = omega * value, omega * slope / self.ramp
+        own, rate, change = risen(np.asarray(t, dtype=float), self.ramp)
+        phase, rate, rate_change = omega * own, omega * rate, omega * change
         samples = np.empty((len(t), 3, 2))
         for axis, multiple in enumerate((1, 2)):
             sin, cos = np.sin(multiple * phase), np.cos(multiple * phase)
@@ -129,6 +147,11 @@ class PickAndPlace:
         _check_points(self, "pick", "place")
         check_numbers(self, {"lift": {}, "wait": {"minimum": 0.0}, "move": _POSITIVE})
 
+    @property
+    def duration(self) -> float:
+        """Of wait and move [s]."""
+        return self.wait + self.move
+
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """See `Trajectory`."""
         s, slope, curvature = smooth_step((t - self.wait) / self.move)
@@ -145,29 +168,6 @@ class PickAndPlace:
         samples[:, 1] = direction * rate[:, None]
         samples[:, 2] = direction * rate_change[:, None] + np.outer(bump_curvature * rate**2, up)
         return samples
-
-
-def read_trajectory(table: Table) -> Trajectory | None:
-    """Take the keys of a scene's [reference] table."""
-    kind = table.text("kind", choices=("none", "hold", "lemniscate", "pick_and_place"))
-    if kind == "hold":
-        return Hold(table.vector("position", 2))
-    if kind == "lemniscate":
-        return Lemniscate(
-            centre=table.vector("centre", 2),
-            size=table.vector("size", 2),
-            period=table.number("period", above=0.0),
-            ramp=table.number("ramp", above=0.0),
-        )
-    if kind == "pick_and_place":
-        return PickAndPlace(
-            pick=table.vector("pick", 2),
-            place=table.vector("place", 2),
-            lift=table.number("lift"),
-            wait=table.number("wait", minimum=0.0),
-            move=table.number("move", above=0.0),
-        )
-    return None
 
 
 def _check_points(instance: Trajectory, *names: str) -> None:

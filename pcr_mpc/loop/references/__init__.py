@@ -1,0 +1,1 @@
+"""Paths that the tip can be asked to follow, and how they are timed."""

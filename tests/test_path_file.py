@@ -1,0 +1,130 @@
+"""Paths from files: read as they are meant, or refused with row, line and what to do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcr_mpc import ModelError, load_path, load_run, load_scene, make_controller, simulate
+from pcr_mpc.loop.references.tabulated import Tabulated
+
+from .conftest import MODELS
+from .drawn import rows, text
+
+SCENES = MODELS / "scenes"
+GOOD = "t_s,x_m,y_m\n0.0,0.0,0.25\n0.1,0.01,0.25\n0.3,0.02,0.26\n0.4,0.02,0.27\n0.7,0.01,0.27\n"
+
+
+def written(tmp_path, content, encoding="utf-8"):
+    path = tmp_path / "path.csv"
+    path.write_text(content, encoding=encoding)
+    return path
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        GOOD,
+        "\ufeff" + GOOD,  # a byte-order mark
+        GOOD.replace("\n", "\r\n"),
+        "# drawn by hand\n\n" + GOOD.replace("\n0.3", "\n\n# half way\n0.3"),
+        GOOD.replace(",", " , "),
+        "y_m,t_s,x_m\n" + "".join(f"{y},{t},{x}\n" for t, x, y in (line.split(",") for line in GOOD.split()[1:])),
+        GOOD.replace("\n0.0,", "\n5.0,").replace("\n0.", "\n5."),  # a clock that does not begin at 0
+    ],
+)
+def test_what_means_the_same_is_read_the_same(tmp_path, content):
+    path = load_path(written(tmp_path, content))
+    same = load_path(written(tmp_path, GOOD))
+    assert path.points == same.points
+    assert path.times == pytest.approx(same.times)
+    assert path.points[2] == (0.02, 0.26)
+    assert path.duration == pytest.approx(0.7)
+
+
+def test_velocities_and_accelerations_are_taken(tmp_path):
+    header = "t_s,x_m,y_m,vx_m_s,vy_m_s,ax_m_s2,ay_m_s2\n"
+    path = load_path(written(tmp_path, header + "0,0,0.25,0,0,0,0\n1,0.1,0.25,0.3,0,0,-1\n"))
+    assert path == Tabulated(
+        (0.0, 1.0), ((0.0, 0.25), (0.1, 0.25)), ((0.0, 0.0), (0.3, 0.0)), ((0.0, 0.0), (0.0, -1.0))
+    )
+    assert path(np.array([1.0]))[0] == pytest.approx(np.array([[0.1, 0.25], [0.3, 0.0], [0.0, -1.0]]))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", r"is empty; its first line has the columns: t_s,x_m,y_m"),
+        ("# nothing\n", "is empty"),
+        ("0.0,0.0,0.25\n0.1,0.01,0.25\n", "begins with numbers; its first line has the names"),
+        (GOOD.replace(",", ";"), "has semicolons between its columns; save it with commas"),
+        (GOOD.replace(",", "\t"), "has tabs between its columns"),
+        (GOOD.replace("x_m", "x_mm"), "column 'x_mm' is not known; did you mean x_m"),
+        (GOOD.replace("t_s", "time"), "column 'time' is not known"),
+        (GOOD.replace("y_m", "x_m"), "has column x_m twice"),
+        (GOOD.replace("t_s,x_m,y_m", "t_s,x_m,vx_m_s"), "has no column y_m; found t_s, x_m, vx_m_s"),
+        ("t_s,x_m,y_m,vx_m_s\n0,0,0.2,0\n", "has only one of vx_m_s and vy_m_s"),
+        ("t_s,x_m,y_m,ax_m_s2,ay_m_s2\n0,0,0.2,0,0\n", "has accelerations without velocities"),
+        (GOOD.replace("0.26", "0,26"), r"line 4 has 4 values for 3 columns; are there commas in its numbers\?"),
+        (GOOD.replace(",0.26", ""), "line 4 has 2 values for 3 columns"),
+        (GOOD.replace("0.26", "high"), "line 4: y_m is 'high', expected a finite number"),
+        (GOOD.replace("0.26", "nan"), "line 4: y_m is 'nan'"),
+        (GOOD.replace("0.26", ""), "line 4: y_m is ''"),
+        (
+            GOOD.replace("\n0.3", "\n0.1"),
+            r"row 3 \(line 4\), t_s = 0.1, is the same time as the row before, t_s = 0.1;",
+        ),
+        (
+            GOOD.replace("\n0.4", "\n0.2").replace("\n0.7", "\n0.1"),
+            r"row 4 \(line 5\), t_s = 0.2, is earlier than the row before, t_s = 0.3; so are 1 more rows; sort",
+        ),
+        (GOOD.replace("0.25", "250"), r"reach 250 m: are these millimetres\?"),
+        ("t_s,x_m,y_m\n" + "".join(f"{33 * i},0.0{i},0.2\n" for i in range(1, 30)), r"in 29 rows: are these milli"),
+        (GOOD[:38], "2 rows, expected at least 4"),
+        ('t_s,x_m,y_m\n0,"0,0.2\n', "line 2 has 2 values|is no CSV"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_place(tmp_path, content, message):
+    path = written(tmp_path, content)
+    with pytest.raises(ModelError, match=message) as caught:
+        load_path(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert caught.value.file == str(path)
+
+
+def test_files_that_are_not_text_or_not_there(tmp_path):
+    with pytest.raises(ModelError, match="is not UTF-8 text"):
+        load_path(written(tmp_path, GOOD, "utf-16"))
+    with pytest.raises(ModelError, match=r"none\.csv: no such file"):
+        load_path(tmp_path / "none.csv")
+    with pytest.raises(ModelError, match="is a folder"):
+        load_path(tmp_path)
+
+
+def test_the_hand_drawn_path_is_made_of_its_seed():
+    assert (SCENES / "hand_drawn.csv").read_text() == text()
+    path = load_path(SCENES / "hand_drawn.csv", smoothing=5e-4)
+    t, points = rows()
+    assert path.times == pytest.approx(t)
+    assert np.array(path.points) == pytest.approx(points)
+
+
+def test_a_scene_finds_its_file_and_its_record_needs_none(tmp_path):
+    """Beside the scene, wherever that is; once a run is recorded, the file may be gone."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    scene_text = (SCENES / "circle_from_file.toml").read_text().replace("../../", f"{MODELS.parent}/")
+    (folder / "scene.toml").write_text(scene_text.replace("../", f"{MODELS}/") + "\n")
+    (folder / "circle_60mm.csv").write_bytes((SCENES / "circle_60mm.csv").read_bytes())
+    scene = load_scene(folder / "scene.toml")
+    assert scene == load_scene(SCENES / "circle_from_file.toml")
+    short = replace(scene, duration=0.1)
+    run = simulate(short, short.make_plant(), make_controller(short))
+    run.save(tmp_path / "run")
+    (folder / "circle_60mm.csv").unlink()
+    back = load_run(tmp_path / "run").scene
+    assert back == short
+    again = simulate(back, back.make_plant(), make_controller(back))
+    assert again.hash() == run.hash()
+    with pytest.raises(ModelError, match=r"mine/circle_60mm\.csv: no such file"):
+        load_scene(folder / "scene.toml")
