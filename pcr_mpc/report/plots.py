@@ -41,7 +41,14 @@ def frame(axes: Any, shapes: np.ndarray, margin: float = 0.03) -> None:
 
 
 def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
-    """Draw one equilibrium with its figures."""
+    """Draw one equilibrium with its figures.
+
+    Parameters
+    ----------
+    eq : Equilibrium
+    path : Path
+        Of the picture; its ending says which kind.
+    """
     figure, axes = plt.subplots(figsize=(6, 5))
     draw_robot(axes, eq)
     frame(axes, eq.shape(60))
@@ -53,7 +60,14 @@ def plot_equilibrium(eq: Equilibrium, path: Path) -> None:
 
 
 def plot_equilibria(found: list[Equilibrium], path: Path) -> None:
-    """Draw all equilibria side by side, in the order of their energies."""
+    """Draw all equilibria side by side, in the order of their energies.
+
+    Parameters
+    ----------
+    found : list of Equilibrium
+    path : Path
+        Of the picture; its ending says which kind.
+    """
     columns = min(4, len(found))
     rows = -(-len(found) // columns)
     figure, panels = plt.subplots(
@@ -90,7 +104,14 @@ def poses_along(run: Run, indices: np.ndarray) -> list[Equilibrium]:
 
 
 def plot_run(run: Run, path: Path) -> None:
-    """Draw path, error, inputs with limits, and step times."""
+    """Draw path, error, inputs with limits, and step times.
+
+    Parameters
+    ----------
+    run : Run
+    path : Path
+        Of the picture; its ending says which kind.
+    """
     figure, ((path_axes, error_axes), (input_axes, time_axes)) = plt.subplots(2, 2, figsize=(11, 8))
     tracked = bool(np.isfinite(run.reference).all())
     summary = run.summary()
@@ -170,7 +191,16 @@ def plot_times(axes: Any, samples: dict[str, tuple[np.ndarray, str]], budgets: d
 
 
 def animate_run(run: Run, path: Path, progress: bool = False) -> None:
-    """Write a GIF of the robot moving."""
+    """Write a GIF of the robot moving.
+
+    Parameters
+    ----------
+    run : Run
+    path : Path
+        Of the animation.
+    progress : bool
+        Show a progress bar on stderr.
+    """
     every = max(1, round(1.0 / _FRAMES_PER_SECOND / run.dt))
     last = min(len(run.t), int(_LONGEST_ANIMATION / run.dt))
     indices = np.arange(0, last, every)

@@ -228,6 +228,11 @@ def _reference(believed: Scene, horizon: int, inertia: str) -> InverseDynamics:
 def run_episode(scene: Scene, tuning: Tuning | Maker, seed: int, spread: Spread = Spread()) -> Row:
     """Run the episode of a seed and judge it; a failing one is a row like the others.
 
+    Parameters
+    ----------
+    scene, tuning, seed, spread
+        As for `simulate_episode`.
+
     Returns
     -------
     dict
