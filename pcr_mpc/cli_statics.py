@@ -44,11 +44,13 @@ def solve_pose(options: argparse.Namespace) -> int:
         eq = forward_statics(robot, q, force)
     else:
         raise ValueError("give --p, --q or both")
-    from .report.tables import equilibrium_record, equilibrium_table
+    from .report.tables import equilibrium_record, equilibrium_table, strain_warnings
 
     if options.equilibria:
         return _equilibria(options, eq)
     print(json.dumps(equilibrium_record(eq)) if options.json else equilibrium_table(eq))
+    for line in strain_warnings(eq):
+        print(f"pcr-mpc: warning: {line}", file=sys.stderr)
     if options.picture:
         from .report.plots import plot_equilibrium
 

@@ -143,10 +143,11 @@ def test_nothing_asked_is_nothing_watched(pair, centre):
 
 
 def test_combinations_are_all_that_rows_may_give(pair):
-    watch = LimitWatch(PoseLimits(1.0, (-1, -1), (1, 1), 0.1, 1.0), Plant(pair))
+    strips = replace(pair, rods=tuple(replace(rod, half_thickness=1e-3) for rod in pair.rods))
+    watch = LimitWatch(PoseLimits(1.0, (-1, -1), (1, 1), 0.1, 1.0, 0.01), Plant(strips))
     found = watch.combinations()
-    assert len(found) == len(set(found)) == 2**4 - 1
-    widths = dict(zip(KINDS, (2, 2, 2, 1), strict=True))
+    assert len(found) == len(set(found)) == 2**5 - 1
+    widths = dict(zip(KINDS, (2, 2, 2, 1, 2), strict=True))
     for kinds in found:
         assert all(kinds.count(kind) == widths[kind] for kind in set(kinds))
         assert list(dict.fromkeys(kinds)) == [kind for kind in KINDS if kind in kinds]

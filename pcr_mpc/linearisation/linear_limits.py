@@ -8,7 +8,9 @@ import numpy as np
 
 from ..frozen import Frozen
 
-KINDS = ("torque", "tip region", "rod margin", "stiffness")
+KINDS = ("torque", "tip region", "rod margin", "stiffness", "strain")
+
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # C, lower, upper, scale of one kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +25,7 @@ class LinearLimits(Frozen):
     lower, upper : ndarray, shape (m,)
         Kept where lower <= C x <= upper; infinite for none.
     scale : ndarray, shape (m,)
-        What one unit of a row is: [N m], [m], 1 and [N/m] by kind.
+        What one unit of a row is: [N m], [m], 1, [N/m] and 1 by kind.
     """
 
     kinds: tuple[str, ...]

@@ -11,18 +11,18 @@ import numpy as np
 from ..buffered import BufferedFunction
 from ..frozen import Remade, set_once
 from ..plant.motion.plant import Plant
+from ..plant.robot import Robot
 from ..plant.rods import elastica
 from ..plant.rods.chart import LEAST_CRITICAL_LOAD, critical_load, critical_load_slope, rough_critical_load
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.state import RobotState
-from .linear_limits import KINDS, LinearLimits
+from .linear_limits import KINDS, LinearLimits, Rows
+from .strain_watch import StrainWatch
 
 # How close to a limit a pose must come before the limit is linearised: its controller then looks a horizon ahead.
 _TORQUE_WATCHED = 0.6  # of the limit
 _MARGIN_WATCHED = 0.25  # above the limit
 _STIFFNESS_WATCHED = 3.0  # times the limit
-
-Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # C, lower, upper, scale
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class PoseLimits:
         Least 1 - lambda / lambda_c of a rod: how far it is to stay from snapping with its tip held.
     stiffness : float or None
         Least eigenvalue of K [N/m]: how far the pose is to stay from snapping with its tip free.
+    strain : float, tuple of float or None
+        Largest strain of the rods, of all or of each; infinite for a rod that may be strained as it likes.
     """
 
     torque: float | None = None
@@ -46,6 +48,15 @@ class PoseLimits:
     tip_upper: tuple[float, float] | None = None
     rod_margin: float | None = None
     stiffness: float | None = None
+    strain: float | tuple[float, ...] | None = None
+
+    def strains(self, robot: Robot) -> np.ndarray:
+        """Largest strain of each rod, shape (n,): infinite where it is not limited, or where no thickness is known."""
+        limits = np.full(robot.n_rods, math.inf)
+        known = [rod.half_thickness is not None for rod in robot.rods]
+        if self.strain is not None:
+            limits[known] = np.broadcast_to(self.strain, limits.shape)[known]
+        return limits
 
 
 @set_once("make a new LimitWatch with them", "limits")
@@ -62,8 +73,8 @@ class LimitWatch(Remade):
     Notes
     -----
     The margins to folds are known of plain rods only, by the closed form: for others (see `Robot.needs_shooting`)
-    limits on them are not watched, only torque and tip region. Where a plant condenses the rods' weight, torques and
-    margins are those of the weightless rods.
+    limits on them are not watched, only torque, tip region and strain. Where a plant condenses the rods' weight, all
+    are those of the weightless rods.
     """
 
     def __init__(self, limits: PoseLimits, plant: Plant) -> None:
@@ -78,10 +89,12 @@ class LimitWatch(Remade):
         if not plain:
             limits = replace(limits, rod_margin=None, stiffness=None)
         self.limits = limits
-        given = (limits.torque, limits.tip_lower, limits.rod_margin, limits.stiffness)
+        self._strain = StrainWatch(limits.strains(robot), self._plant)
+        strained = self._strain.count or None
+        given = (limits.torque, limits.tip_lower, limits.rod_margin, limits.stiffness, strained)
         self._present = tuple(kind for kind, limit in zip(KINDS, given, strict=True) if limit is not None)
         n = robot.n_rods
-        self._counts = dict(zip(KINDS, (n, 2, n, 1), strict=True))
+        self._counts = dict(zip(KINDS, (n, 2, n, 1, self._strain.count), strict=True))
         self._moment_units = robot.stiffnesses / robot.lengths
         # What takes long at first is not left to the first limit that comes near.
         if limits.rod_margin is not None:
@@ -113,7 +126,7 @@ class LimitWatch(Remade):
         `elastica`); NaN is not far.
         """
         limits, n = self.limits, (len(signs) - 1) // 3
-        if limits.tip_lower is not None:
+        if limits.tip_lower is not None or not self._strain.far(signs[1 + 2 * n :]):
             return False
         if limits.torque is not None and not max(map(abs, signs[1 : 1 + n])) < _TORQUE_WATCHED * limits.torque:
             return False
@@ -144,6 +157,7 @@ class LimitWatch(Remade):
             "tip region": self._tip_region(len(x)),
             "rod margin": self._rod_margins(x, state),
             "stiffness": self._stiffness(x, state),
+            "strain": self._strain.rows(x, state),
         }
         found = [(kind, *rows) for kind, rows in near.items() if rows is not None]
         if not found:

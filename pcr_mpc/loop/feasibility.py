@@ -17,8 +17,8 @@ def check_scene(scene: Scene) -> list[str]:
     Returns
     -------
     list of str
-        Where and by how much the reference asks for more than the limits on rate, change of rate, torque, tip region
-        and margins: there a controller must leave it. Empty if all can be had.
+        Where and by how much the reference asks for more than the limits on rate, change of rate, torque, tip region,
+        margins and strain: there a controller must leave it. Empty if all can be had.
 
     Raises
     ------
@@ -61,7 +61,20 @@ def reference_excess(scene: Scene, reference: InverseDynamics) -> list[str]:
                 f"the reference leads to {name} of {values[k]:.4g} at t = {k * period:.3f} s, where {least:.4g} is to "
                 f"be kept; {_share(short)}"
             )
+    found.append(_overstrained(reference.strains[: count + 1], scene.strain_limits, period))
     return [line for line in found if line]
+
+
+def _overstrained(strains: np.ndarray, limits: np.ndarray, period: float) -> str:
+    share = np.nan_to_num(strains / limits)
+    excess = share > 1.0 + _ROUNDING
+    if not excess.any():
+        return ""
+    k, i = np.unravel_index(int(share.argmax()), share.shape)
+    return (
+        f"the reference strains rod {i} by {100 * strains[k, i]:.3g} % at t = {k * period:.3f} s, where its material "
+        f"bears {100 * limits[i]:.3g} %; {_share(excess.any(axis=1))}"
+    )
 
 
 def _beyond(what: str, values: np.ndarray, limit: float, period: float) -> str:

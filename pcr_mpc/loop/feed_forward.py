@@ -48,6 +48,8 @@ class InverseDynamics(Frozen, Reference):
         Least eigenvalue of K [N/m].
     rod_margin : ndarray, shape (K,)
         Least of the rods (see `least_rod_margin`).
+    strains : ndarray, shape (K, n)
+        Largest of each rod; NaN where no thickness is known.
     """
 
     angles_per_force: np.ndarray
@@ -55,6 +57,7 @@ class InverseDynamics(Frozen, Reference):
     torques_per_force: np.ndarray
     stiffness: np.ndarray
     rod_margin: np.ndarray
+    strains: np.ndarray
 
 
 def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, inertia: str = "none") -> InverseDynamics:
@@ -137,6 +140,7 @@ def _inverse_dynamics(
         torques_per_force=np.stack([eq.dtorque_dq for eq in poses])[:, :, None] * levers,
         stiffness=np.array([eq.stiffness_eigenvalues[0] for eq in poses]),
         rod_margin=np.array([least_rod_margin(eq) for eq in poses]),
+        strains=np.stack([eq.max_strain for eq in poses]),
     )
 
 

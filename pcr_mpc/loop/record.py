@@ -45,6 +45,7 @@ ARRAYS = {
 _DERIVED = {
     "torques": "of the motors at the M + 1 starts and ends of control periods, by the exact rods [N m]; NaN where "
     "they were lost",
+    "strains": "largest of each rod, likewise [-]; NaN where no thickness is known, too",
 }
 _OTHERS = ("scene", "controller", "plant", "seed", "pose", "dt", "active_limits", "slack", "rungs", "events", "rung",
            "tuning", "believed", "versions")  # fmt: skip
@@ -107,6 +108,7 @@ def record(run: Any) -> dict[str, Any]:
     return {
         **{name: getattr(run, name) for name in ARRAYS},
         "torques": run.torques,
+        "strains": run.strains,
         "about": json.dumps(ARRAYS | _DERIVED),
         "format": FORMAT,
         "record": to_text(others),
@@ -117,11 +119,12 @@ def record(run: Any) -> dict[str, Any]:
 def write_csv(run: Any, path: Path) -> None:
     """Write a row for each plant step of a `Run` (see `Run.save`)."""
     n, per = run.scene.robot.n_rods, run.steps_per_period
+    thick = [i for i, rod in enumerate(run.scene.robot.rods) if rod.half_thickness is not None]
     state = ["p_x_m", "p_y_m", "v_x_m_s", "v_y_m_s", *(f"q{i}_rad" for i in range(n))]
     names = ["t_s", *state, "ref_x_m", "ref_y_m", *(f"u{i}_rad_s" for i in range(n)),
              *(f"u{i}_applied_rad_s" for i in range(n)), *(f"measured_{name}" for name in state),
              *(f"estimated_{name}" for name in state), "estimated_force_x_N", "estimated_force_y_N",
-             *(f"torque{i}_Nm" for i in range(n))]  # fmt: skip
+             *(f"torque{i}_Nm" for i in range(n)), *(f"strain{i}" for i in thick)]  # fmt: skip
     # What there is none of, in a run that failed at once, is NaN.
     applied = run.applied if len(run.applied) else np.full((1, n), np.nan)
     decided = np.hstack([run.u, run.measured, run.estimate, run.estimated_force])
@@ -130,7 +133,7 @@ def write_csv(run: Any, path: Path) -> None:
     period = np.minimum(k // per, len(decided) - 1)
     rows = np.hstack(
         [run.t[:, None], run.x, run.reference, decided[period, :n], applied[np.minimum(k, len(applied) - 1)],
-         decided[period, n:], run.torques[k // per]]
+         decided[period, n:], run.torques[k // per], run.strains[k // per][:, thick]]
     )  # fmt: skip
     with open(path, "w", newline="", encoding="utf-8") as handle:
         writer = csv.writer(handle)

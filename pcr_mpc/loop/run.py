@@ -152,25 +152,59 @@ class Run(Frozen):
 
     @cached_property
     def _poses(self) -> np.ndarray:
-        """Of the exact rods at the starts and ends of control periods: torques, least rod margin, least stiffness.
+        """Of the exact rods at the starts and ends of control periods: torques, strains, rod margin, stiffness.
 
         NaN from where the rods were lost, if they were: by a run that failed there, or by a snap.
         """
         plant, states = Plant(self.scene.robot, dt=self.dt), self.x[:: self.steps_per_period]
         plant.reset(self.x[0], self.pose)
-        found = np.full((len(states), self.scene.robot.n_rods + 2), np.nan)
+        found = np.full((len(states), 2 * self.scene.robot.n_rods + 2), np.nan)
         for k, x in enumerate(states):
             try:
                 eq = plant.equilibrium(x)
             except (PCRError, ValueError):
                 break
-            found[k] = *eq.motor_torque, least_rod_margin(eq), eq.stiffness_eigenvalues[0]
+            found[k] = *eq.motor_torque, *eq.max_strain, least_rod_margin(eq), eq.stiffness_eigenvalues[0]
         return read_only(found)
 
     @property
     def torques(self) -> np.ndarray:
         """Of the motors at the starts and ends of control periods, shape (M + 1, n) [N m]; NaN where rods were lost."""
-        return self._poses[:, :-2]
+        return self._poses[:, : self.scene.robot.n_rods]
+
+    @property
+    def strains(self) -> np.ndarray:
+        """Largest of each rod at the starts and ends of control periods, shape (M + 1, n) [-].
+
+        NaN where rods were lost, or where no thickness is known.
+        """
+        return self._poses[:, self.scene.robot.n_rods : -2]
+
+    @property
+    def peak_strain(self) -> float | None:
+        """Largest strain of a rod, at the control periods, up to where the rods were lost; None if none is known."""
+        known = self.strains[np.isfinite(self.strains)]
+        return float(known.max()) if len(known) else None
+
+    def overstrained(self) -> list[dict[str, Any]]:
+        """Events of a rod that is strained beyond its limit: one for each stretch of time, with the largest strain."""
+        limits, period = self.scene.strain_limits, self.scene.period
+        found = []
+        for i, (strains, limit) in enumerate(zip(self.strains.T, limits.tolist(), strict=True)):
+            # Written so that NaN is no excess.
+            beyond = np.concatenate([[False], strains > (1 + _POSE_SLACK) * limit, [False]])
+            for first, after in np.flatnonzero(np.diff(beyond)).reshape(-1, 2).tolist():
+                worst = first + int(strains[first:after].argmax())
+                found.append(
+                    {
+                        "t": first * period,
+                        "kind": "strain",
+                        "message": f"rod {i} is strained by up to {100 * strains[worst]:.3g} % (at t = "
+                        f"{worst * period:.3f} s), beyond its limit of {100 * limit:.3g} %, for {after - first} of "
+                        f"{len(strains)} starts and ends of periods",
+                    }
+                )
+        return sorted(found, key=lambda event: float(event["t"]))
 
     @property
     def peak_torque(self) -> float:
@@ -184,7 +218,8 @@ class Run(Frozen):
         """
         limits, tips = self.scene.pose_limits, self.x[:: self.steps_per_period, :2]
         margins, stiffness = self._poses[:, -2:].T
-        given = dict(zip(KINDS, (True, limits.tip_lower, limits.rod_margin, limits.stiffness), strict=True))
+        strained = True if np.isfinite(self.scene.strain_limits).any() else None
+        given = dict(zip(KINDS, (True, limits.tip_lower, limits.rod_margin, limits.stiffness, strained), strict=True))
         broken = {"torque": (np.abs(self.torques) > (1 + _POSE_SLACK) * self.scene.torque_limit).any(axis=1)}
         if limits.tip_lower is not None and limits.tip_upper is not None:
             lower, upper = np.array(limits.tip_lower), np.array(limits.tip_upper)
@@ -194,6 +229,7 @@ class Run(Frozen):
             broken["rod margin"] = margins < limits.rod_margin - _POSE_SLACK
         if limits.stiffness is not None:
             broken["stiffness"] = stiffness < (1 - _POSE_SLACK) * limits.stiffness
+        broken["strain"] = (self.strains > (1 + _POSE_SLACK) * self.scene.strain_limits).any(axis=1)
         return {kind: int(broken[kind].sum()) for kind, limit in given.items() if limit is not None}
 
     def deadline_misses(self) -> int:
@@ -257,6 +293,7 @@ class Run(Frozen):
         late = error_mm[self.t >= 1.0]
         kinds = [event["kind"] for event in self.events]
         rungs = Counter(event["rung"] for event in self.events if event["kind"] == "fallback")
+        least = float(self.scene.strain_limits.min())
         return {
             "scene": self.scene.name,
             "verdict": self.verdict(),
@@ -287,6 +324,8 @@ class Run(Frozen):
             },
             "peak_torque_Nm": self.peak_torque,
             "torque_limit_Nm": self.scene.torque_limit,
+            "peak_strain": self.peak_strain,
+            "strain_limit": least if math.isfinite(least) else None,
             "pose_violations": self.pose_violations(),
             "statics_rungs": self.rungs,
             "limit_violations": self.limit_violations(),
@@ -300,7 +339,7 @@ class Run(Frozen):
             "warnings": kinds.count("warning"),
             "refused_measurements": kinds.count("measurement"),
             "failures": kinds.count("failure") or len(self._lost()),
-            "events": self.events,
+            "events": sorted([*self.events, *self.overstrained()], key=lambda event: float(event["t"])),
             "run_hash": self.hash(),
         }
 

@@ -11,6 +11,7 @@ import numpy as np
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, UnreachableError
 from ..linearisation.pose_limits import PoseLimits
+from ..plant.materials import check_unit
 from ..plant.motion.plant import Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.statics.equilibrium import Equilibrium
@@ -168,6 +169,11 @@ class Scene:
     def torque_limit(self) -> float:
         """Of the motors, or of the poses if that is less [N m]."""
         return min(self.robot.torque_limit, self.pose_limits.torque or math.inf)
+
+    @property
+    def strain_limits(self) -> np.ndarray:
+        """Of the rods' materials, or of the poses if that is less, shape (n,) [-]; infinite where there is none."""
+        return np.asarray(np.minimum(self.robot.strain_limits, self.pose_limits.strains(self.robot)))
 
     def start(self) -> Equilibrium:
         """Solve for the pose in which the robot starts, in balance without load.
@@ -342,4 +348,17 @@ def _pose_limits(table: Table, robot: Robot) -> PoseLimits:
         corners[1],
         table.number("rod_margin", _LEAST_ROD_MARGIN, minimum=0.0, maximum=0.9) or None,
         table.number("stiffness", softness, minimum=0.0) or None,
+        _strain_limit(table, robot),
     )
+
+
+def _strain_limit(table: Table, robot: Robot) -> float | tuple[float, ...] | None:
+    """Of the rods' materials unless the scene has its own."""
+    if table.has("strain"):
+        own = table.number("strain", minimum=0.0)
+        check_unit("strain", own)
+        if own and all(rod.half_thickness is None for rod in robot.rods):
+            raise table.fail("strain", f"no rod of {robot.name} has a section, and so no strain is known; state it")
+        return own or None
+    limits = robot.strain_limits
+    return tuple(limits.tolist()) if np.isfinite(limits).any() else None

@@ -86,7 +86,7 @@ def check_unit(name: str, value: float) -> None:
         advice = "is it in pascals? 206 GPa are 206e9"
     elif name == "density" and not _LIGHTEST <= value <= _HEAVIEST:
         advice = "is it in kg/m^3? 7.85 g/cm^3 are 7850"
-    elif name == "strain_limit" and value > _LARGEST_STRAIN:
+    elif name in ("strain_limit", "strain") and value > _LARGEST_STRAIN:
         advice = "it is a ratio, not per cent: 1 % is 0.01"
     else:
         return

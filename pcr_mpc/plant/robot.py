@@ -125,6 +125,11 @@ class Robot(Frozen):
         return read_only(np.array([rod.bending_stiffness for rod in self.rods]))
 
     @cached_property
+    def strain_limits(self) -> np.ndarray:
+        """Largest strains that the rods' materials bear, shape (n,) [-]; infinite where that is not known."""
+        return read_only(np.array([rod.strain_limit for rod in self.rods]))
+
+    @cached_property
     def force_scale(self) -> float:
         """Sum of EI/L^2, the size of the rods' forces [N]."""
         return float((self.stiffnesses / self.lengths**2).sum())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,8 @@ from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.stability import assess_stability
 from ..study.tuning_space import Search
 from ..study.tuning_study import Chosen
+
+_TOLD = ("warning", "strain")  # kinds of events that are put into words
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -64,6 +67,7 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"inside the solver {_percent(summary['solver_share'])} of the control steps' time",
         f"QP iterations     p50 {iterations['p50']}, max {iterations['max']}",
         f"peak torque       {summary['peak_torque_Nm']:.3f} N m (limit {summary['torque_limit_Nm']:g}, soft)",
+        *_strain_line(summary["peak_strain"], summary["strain_limit"]),
         f"poses beyond      {_counts({k: v for k, v in summary['pose_violations'].items() if v})}",
         f"limits active in  {_counts(summary['active_limits'])} of {summary['control_steps']} periods",
         f"largest slack     {', '.join(f'{k} {v:.3g}' for k, v in summary['slack'].items()) or 'none'}",
@@ -72,9 +76,15 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"deadline misses   {summary['deadline_misses']}",
         f"not believed      {summary['refused_measurements']} measurements",
         f"failures          {summary['failures']}",
-        *(f"warning           {event['message']}" for event in summary["events"] if event["kind"] == "warning"),
+        *(f"warning           {event['message']}" for event in summary["events"] if event["kind"] in _TOLD),
     ]
     return "\n".join(lines)
+
+
+def _strain_line(strain: float | None, limit: float | None) -> list[str]:
+    if strain is None:
+        return []
+    return [f"largest strain    {100 * strain:.3f} %" + ("" if limit is None else f" (limit {100 * limit:g} %, soft)")]
 
 
 def _need_lines(rung: dict[str, Any] | None, need: dict[str, Any] | None) -> list[str]:
@@ -163,11 +173,31 @@ def equilibrium_record(eq: Equilibrium) -> dict[str, Any]:
         "motor_torque": eq.motor_torque.tolist(),
         "energy": eq.energy,
         "rod_forces": eq.rod_forces.tolist(),
+        "max_strain": [None if math.isnan(strain) else strain for strain in eq.max_strain.tolist()],
+        "strain_limit": [None if math.isinf(limit) else limit for limit in eq.robot.strain_limits.tolist()],
+        "overstrained": list(eq.overstrained),
         "residual_norm": eq.residual_norm,
         "iterations": eq.iterations,
         "drift": eq.drift,
         "converged": eq.converged,
     }
+
+
+def strain_warnings(eq: Equilibrium) -> list[str]:
+    """Say of each rod that is strained beyond its limit what would help."""
+    return [
+        f"rod {i} is strained by {100 * eq.max_strain[i]:.3g} %, and its material bears {100 * limit:.3g} %: it "
+        f"will not come back as it was, if at all; take a pose that bends it less, or a section at most "
+        f"{2e3 * limit / eq.max_strain[i] * (eq.robot.rods[i].half_thickness or 0.0):.3g} mm thick"
+        for i, limit in ((i, eq.robot.strain_limits[i]) for i in eq.overstrained)
+    ]
+
+
+def _strains(eq: Equilibrium) -> str:
+    """Of each rod, of what its material bears."""
+    limits = ["" if math.isinf(limit) else f" of {100 * limit:g}" for limit in eq.robot.strain_limits.tolist()]
+    strains = ["not known" if math.isnan(strain) else f"{100 * strain:.4g}" for strain in eq.max_strain.tolist()]
+    return ", ".join(strain + limit for strain, limit in zip(strains, limits, strict=True))
 
 
 def equilibria_table(found: Sequence[Equilibrium]) -> str:
@@ -212,6 +242,7 @@ def equilibrium_table(eq: Equilibrium) -> str:
         ("motor torque dU/dq [N m]", vector(without_rounding(eq.motor_torque, eq.robot.force_scale * length))),
         ("eigenvalues of K [N/m]", vector(eq.stiffness_eigenvalues)),
         ("energy U [J]", f"{eq.energy:.8g}"),
+        *([("largest strain [%]", _strains(eq))] if np.isfinite(eq.max_strain).any() else []),
         (
             "method",
             f"{eq.method}, {eq.iterations} iterations, residual {eq.residual_norm:.1e}, drift {eq.drift:.1e}",

@@ -14,6 +14,7 @@ from ..robot import Robot
 from ..rods.equations import RodPhysics, sample_rod
 from ..rods.method import TO_NODES, enough_nodes
 from ..rods.physics import robot_physics
+from ..rods.strain import largest_moment, largest_strain, strain_along
 from .state import Columns, columns
 
 
@@ -166,14 +167,48 @@ class Equilibrium(Frozen):
 
     def shape(self, n_points: int = 50) -> np.ndarray:
         """Centrelines from base to tip, shape (n, n_points, 2) [m]."""
-        if n_points < 2:
-            raise ValueError(f"n_points is {n_points}, expected at least 2")
+        _require_points(n_points)
         return np.stack(
             [
                 rod.base + rod.length * sample_rod(nodes, n_points, physics)[:2].T
                 for rod, nodes, physics in zip(self.robot.rods, self.nodes, self.physics, strict=True)
             ]
         )
+
+    def strain(self, n_points: int = 50) -> np.ndarray:
+        """Strain of the outermost fibres from base to tip, shape (n, n_points) [-]; NaN where no thickness is known.
+
+        It is |kappa - kappa0| times half the thickness, and the stretch of a rod that does.
+        """
+        _require_points(n_points)
+        rods = zip(self.robot.rods, self.nodes, self.physics, strict=True)
+        return np.stack([strain_along(*rod, n_points) for rod in rods])
+
+    @cached_property
+    def max_strain(self) -> np.ndarray:
+        """Largest strain of each rod, shape (n,) [-], exact for plain rods; NaN where no thickness is known."""
+        found = np.full(self.robot.n_rods, np.nan)
+        for i, (rod, physics) in enumerate(zip(self.robot.rods, self.physics, strict=True)):
+            if rod.half_thickness is None:
+                continue
+            if physics is None:
+                unit = rod.bending_stiffness / rod.length**2
+                n_x, n_y = (self.rod_forces[i] / unit).tolist()
+                m = float(self.motor_torque[i]) / (unit * rod.length)
+                found[i] = rod.half_thickness / rod.length * largest_moment(float(self.q[i]), n_x, n_y, -m)
+            else:
+                found[i] = largest_strain(rod, self.nodes[i], physics)[1]
+        return read_only(found)
+
+    @property
+    def overstrained(self) -> tuple[int, ...]:
+        """Rods strained beyond what their material bears."""
+        return tuple(np.flatnonzero(self.max_strain > self.robot.strain_limits).tolist())
+
+
+def _require_points(n_points: int) -> None:
+    if n_points < 2:
+        raise ValueError(f"n_points is {n_points}, expected at least 2")
 
 
 def moment_units(robot: Robot) -> np.ndarray:
