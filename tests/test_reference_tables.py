@@ -129,7 +129,7 @@ def test_tip_and_duration_may_be_left_to_the_reference(tmp_path):
     path.write_text(text)
     scene = load_scene(path)
     assert scene.start_tip == tuple(scene.trajectory(np.zeros(1))[0, 0].tolist())
-    assert scene.trajectory.duration <= scene.duration < scene.trajectory.duration + scene.period
+    assert scene.trajectory.duration <= scene.duration < scene.trajectory.duration + 10 * scene.period
     path.write_text(text.replace("repeat = 2", 'repeat = "for ever"'))
     with pytest.raises(ModelError, match="duration: missing"):
         load_scene(path)

@@ -100,7 +100,7 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     loads = carried[:, None] * (np.array(robot.gravity) - a)
     forces = loads - robot.tip_mass * a - robot.drag * v
     resting = carried[:, None] * np.array(robot.gravity)
-    poses = _poses(robot, pose, t, p, forces, resting, a)
+    poses = poses_along(robot, pose, t, p, forces, resting, a)
     q = np.stack([eq.q for eq in poses])
     if inertia != "none":
         plant = Plant(robot, inertia=inertia)
@@ -108,7 +108,7 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
             plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
             momentum, push, own = _momentum(plant, carried, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
             forces = loads + push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
-            poses = _poses(robot, pose, t, p, forces, resting, a)
+            poses = poses_along(robot, pose, t, p, forces, resting, a)
             before, q = q, np.stack([eq.q for eq in poses])
             change = float(np.abs(q - before).max())
             if change < _SETTLED:
@@ -164,13 +164,13 @@ def held(
     on_the_way = np.unique([*range(0, k, _STRIDE), k])
     p = reference.states[[*on_the_way, k], :2]
     forces = np.vstack([reference.forces[on_the_way], payload * np.array(robot.gravity)])
-    end = _poses(robot, pose, np.full(len(p), np.nan), p, forces, forces, np.zeros_like(p))[-1]
+    end = poses_along(robot, pose, np.full(len(p), np.nan), p, forces, forces, np.zeros_like(p))[-1]
     state = np.concatenate([end.p, np.zeros(2), end.q])
     states, forces = np.tile(state, (count + 1, 1)), np.tile(forces[-1], (count + 1, 1))
     return _inverse_dynamics(states, np.zeros((count, robot.n_rods)), forces, [end] * (count + 1))
 
 
-def _poses(
+def poses_along(
     robot: Robot,
     pose: Equilibrium,
     t: np.ndarray,
@@ -186,38 +186,51 @@ def _poses(
         try:
             eq = inverse_statics(robot, p[k], forces[k], guess=eq)
         except PCRError as error:
-            fast = ""
-            if share := _share_of_motion(robot, eq, p[k], forces[k], resting[k]):
-                slower = math.ceil(10.0 / math.sqrt(share)) / 10.0
-                fast = (
-                    f"it asks for an acceleration of {math.hypot(*accelerations[k]):.3g} m/s^2, and the rods, which "
-                    f"could rest there, can give {100 * share:.0f} % of the force that its motion takes; smooth it, or "
-                    f"make it slower by a factor of at least {slower:g}: "
-                )
-            raise type(error)(f"reference at t = {t[k]:.3f} s: {fast}{error}", **error.details) from None
+            raise _explained(robot, pose, t, p, forces, resting, accelerations, k, error) from None
         poses.append(eq)
     return poses
 
 
-def _share_of_motion(
-    robot: Robot, before: Equilibrium, p: np.ndarray, force: np.ndarray, resting: np.ndarray
-) -> float | None:
-    """Share of ``force`` beyond ``resting`` that the rods can carry at p; None if they cannot even rest there."""
-
-    def possible(share: float) -> bool:
-        try:
-            inverse_statics(robot, p, resting + share * (force - resting), guess=before)
-        except PCRError:
-            return False
-        return True
-
-    if np.array_equal(force, resting) or not possible(0.0):
-        return None
+def _explained(
+    robot: Robot,
+    pose: Equilibrium,
+    t: np.ndarray,
+    p: np.ndarray,
+    forces: np.ndarray,
+    resting: np.ndarray,
+    accelerations: np.ndarray,
+    k: int,
+    error: PCRError,
+) -> PCRError:
+    """The error of place k, blamed on the motion if all places could be held at rest, and by how much then."""
+    stop = (k, error) if np.array_equal(forces, resting) else _first_lost(robot, pose, p, resting)
+    if stop is not None:
+        k, error = stop
+        return type(error)(f"reference at t = {t[k]:.3f} s: {error}", **error.details)
     low, high = 0.0, 1.0
     while high - low > _SHARE_RESOLUTION:
         middle = (low + high) / 2
-        low, high = (middle, high) if possible(middle) else (low, middle)
-    return low or high
+        kept = _first_lost(robot, pose, p, resting + middle * (forces - resting)) is None
+        low, high = (middle, high) if kept else (low, middle)
+    share = low or high
+    slower = math.ceil(10.0 / math.sqrt(share)) / 10.0
+    return type(error)(
+        f"reference at t = {t[k]:.3f} s: it asks for an acceleration of {math.hypot(*accelerations[k]):.3g} m/s^2, and "
+        f"the rods, which could rest there and everywhere on it, can give {100 * share:.0f} % of the force that its "
+        f"motion takes; smooth it, or make it slower by a factor of at least {slower:g}: {error}",
+        **error.details,
+    )
+
+
+def _first_lost(robot: Robot, pose: Equilibrium, p: np.ndarray, forces: np.ndarray) -> tuple[int, PCRError] | None:
+    """First place at which the rods cannot carry the force there, and why; None if they can all the way."""
+    for k in range(len(p)):
+        interrupt.check()
+        try:
+            pose = inverse_statics(robot, p[k], forces[k], guess=pose)
+        except PCRError as error:
+            return k, error
+    return None
 
 
 def _momentum(

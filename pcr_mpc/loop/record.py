@@ -48,7 +48,7 @@ _DERIVED = {
     "strains": "largest of each rod, likewise [-]; NaN where no thickness is known, too",
 }
 _OTHERS = ("scene", "controller", "plant", "seed", "pose", "dt", "active_limits", "slack", "rungs", "events", "rung",
-           "tuning", "believed", "versions")  # fmt: skip
+           "tuning", "believed", "versions", "asked")  # fmt: skip
 FORMAT = 1
 
 

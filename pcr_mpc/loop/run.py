@@ -94,6 +94,8 @@ class Run(Frozen):
         What the controller took the robot for, where it says so.
     versions : dict
         Of the toolkit and of what does its arithmetic.
+    asked : dict or None
+        What the reference asks of motors and tip at most (see `reference_demand`), where the controller knows it.
     """
 
     scene: Scene
@@ -122,6 +124,7 @@ class Run(Frozen):
     tuning: Tuning | None = field(kw_only=True)
     believed: Robot | None = field(kw_only=True)
     versions: dict[str, str] = field(kw_only=True)
+    asked: dict[str, Any] | None = field(default=None, kw_only=True)
 
     @property
     def steps_per_period(self) -> int:
@@ -322,6 +325,7 @@ class Run(Frozen):
                 "p50": int(np.median(self.iterations)) if len(self.iterations) else None,
                 "max": int(self.iterations.max(initial=0)),
             },
+            "asked": self.asked,
             "peak_torque_Nm": self.peak_torque,
             "torque_limit_Nm": self.scene.torque_limit,
             "peak_strain": self.peak_strain,

@@ -21,10 +21,12 @@ from .references.blended import duration_of
 from .references.reading import read_reference
 from .scene_checks import LATE, check_scene, is_multiple
 from .settings import Finding, Need, Payload, PlantSettings, read_finding, read_need, read_payload, read_plant
-from .trajectory import Trajectory
+from .trajectory import Trajectory, sampled
 
 # Distance of the start from the reference that is taken for the same place, in rod lengths: found, and as given.
 _START_TOLERANCE, _START_ROUNDING = 2.5e-3, 2.5e-9
+_TENS = 10  # control periods, of which a duration that follows from the reference is a multiple
+_MILLIMETRES = 10.0  # times too far, from which a reference may be in other units
 _LOST = 0.1  # of the shortest rod
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
@@ -298,10 +300,10 @@ def load_scene(path: str | Path) -> Scene:
 
 
 def _duration(file: Table, trajectory: Trajectory | None, period: float) -> float:
-    """As stated, or as long as the reference takes, in whole control periods."""
+    """As stated, or as long as the reference takes, in tens of control periods: other periods are to fit, too."""
     if file.has("duration") or trajectory is None or math.isinf(duration_of(trajectory)):
         return file.number("duration", above=0.0)
-    return period * math.ceil(duration_of(trajectory) / period - 1e-9)
+    return _TENS * period * math.ceil(duration_of(trajectory) / (_TENS * period) - 1e-9)
 
 
 def _require_within_stops(scene: Scene) -> None:
@@ -321,17 +323,33 @@ def _require_reach(scene: Scene) -> None:
         try:
             scene.robot.require_reachable(np.array(scene.start_tip))
         except UnreachableError as error:
-            raise ModelError(f"{scene.name}: start.tip: {error}", key="start.tip", **error.details) from None
+            units = _units_hint(error.distance - error.length, scene.robot)
+            raise ModelError(f"{scene.name}: start.tip: {error}{units}", key="start.tip", **error.details) from None
     if scene.trajectory is None:
         return
     t = scene.period * np.arange(scene.n_periods + 1)
-    for at, tip in zip(t, scene.trajectory(t)[:, 0], strict=True):
-        try:
-            scene.robot.require_reachable(tip)
-        except UnreachableError as error:
-            raise ModelError(
-                f"{scene.name}: reference at t = {at:.3f} s: {error}", key="reference", t=float(at), **error.details
-            ) from None
+    tips = sampled(scene.trajectory, t)[:, 0]
+    robot = scene.robot
+    beyond = np.linalg.norm(tips[:, None] - robot.bases, axis=2) - robot.lengths
+    if not (outside := (beyond >= 0).any(axis=1)).any():
+        return
+    first, farthest = int(outside.argmax()), np.unravel_index(int(beyond.argmax()), beyond.shape)
+    most = float(beyond[farthest])
+    try:
+        robot.require_reachable(tips[first])
+    except UnreachableError as error:
+        worst = f"; at t = {t[farthest[0]]:.3f} s rod {farthest[1]} is {1e3 * most:.4g} mm too short"
+        raise ModelError(
+            f"{scene.name}: reference at t = {t[first]:.3f} s: {error}{worst if most > 0 else ''}"
+            f"{_units_hint(most, robot)}",
+            key="reference",
+            t=float(t[first]),
+            **error.details,
+        ) from None
+
+
+def _units_hint(short: float, robot: Robot) -> str:
+    return "; is it in millimetres?" if short > _MILLIMETRES * float(robot.lengths.max()) else ""
 
 
 def _pose_limits(table: Table, robot: Robot) -> PoseLimits:

@@ -17,7 +17,7 @@ from ..control.tuning import Tuning
 from ..errors import SimulationError, checked_array, checked_integer
 from ..plant.robot import Robot
 from .controllers import Controller, decision_of, name_of
-from .feasibility import reference_excess
+from .feasibility import demand_line, reference_demand, reference_excess
 from .feed_forward import InverseDynamics
 from .foreign_parts import check_parts
 from .record import versions
@@ -97,9 +97,15 @@ def simulate(
     slack: dict[str, float] = {}
     events: list[dict[str, Any]] = []
     # What only some controllers know of themselves.
-    asked, tuning, believed = (getattr(controller, name, None) for name in ("reference", "tuning", "robot"))
-    if isinstance(asked, InverseDynamics):
-        for line in reference_excess(scene, asked):
+    dynamics, tuning, believed = (getattr(controller, name, None) for name in ("reference", "tuning", "robot"))
+    asked = None
+    if isinstance(dynamics, InverseDynamics) and scene.trajectory is not None:
+        asked = reference_demand(scene, dynamics)
+        if progress:
+            print(f"{scene.name}: the reference asks for at most {demand_line(asked)}", file=sys.stderr)
+        # For somebody who looks on, how much slower it must be is solved for; else to first order.
+        known = believed if isinstance(believed, Robot) else scene.robot
+        for line in reference_excess(scene, dynamics, pose if progress else None, known):
             events.append({"t": 0.0, "kind": "warning", "message": line})
             if progress:
                 print(f"{scene.name}: warning: {line}", file=sys.stderr)
@@ -139,6 +145,7 @@ def simulate(
             tuning=tuning if isinstance(tuning, Tuning) else None,
             believed=believed if isinstance(believed, Robot) else None,
             versions=versions(),
+            asked=asked,
         )
 
     try:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..loop.feasibility import demand_line
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.stability import assess_stability
 from ..study.tuning_space import Search
@@ -66,6 +67,7 @@ def summary_table(summary: dict[str, Any]) -> str:
     lines += [
         f"inside the solver {_percent(summary['solver_share'])} of the control steps' time",
         f"QP iterations     p50 {iterations['p50']}, max {iterations['max']}",
+        *([f"asked for         {demand_line(summary['asked'])}"] if summary.get("asked") else []),
         f"peak torque       {summary['peak_torque_Nm']:.3f} N m (limit {summary['torque_limit_Nm']:g}, soft)",
         *_strain_line(summary["peak_strain"], summary["strain_limit"]),
         f"poses beyond      {_counts({k: v for k, v in summary['pose_violations'].items() if v})}",
