@@ -131,16 +131,17 @@ def checking(horizon: int, n: int, models: int) -> Any:
     Returns
     -------
     casadi.Function
-        (models (size, 1 or N), x (4 + n), inputs (n, N), multipliers of rates and changes (2 N n), P, q, l, u, bounds
-        (n, 4), dt) -> states (4 + n, N + 1), [largest violation of the rows of rates and changes, largest entry of
-        P U + q + A'y, largest excess of an angle over its limits [rad], largest multipliers of rates and of changes].
+        (models (size, 1 or N), x (4 + n), P, q, l, u, bounds (n, 4), dt, clear [rad/s], inputs (n, N), multipliers of
+        rates and changes (2 N n)) -> states (4 + n, N + 1), [largest violation of the rows of rates and changes,
+        largest entry of P U + q + A'y, largest excess of an angle over its limits [rad], largest multipliers of rates
+        and of changes, 1 if the first rates keep the limits as they are and no stop is nearer than ``clear`` dt].
     """
     n_states, size = 4 + n, horizon * n
     packed = ca.MX.sym("models", n_states * (n_states + 1 + n + 2), models)
     x, inputs, y = ca.MX.sym("x", n_states), ca.MX.sym("inputs", n, horizon), ca.MX.sym("y", 2 * size)
     upper_triangle, q = ca.MX.sym("P", size * (size + 1) // 2), ca.MX.sym("q", size)
     lower, upper = ca.MX.sym("l", 3 * size), ca.MX.sym("u", 3 * size)
-    bounds, dt = ca.MX.sym("bounds", n, 4), ca.MX.sym("dt")
+    bounds, dt, clear = ca.MX.sym("bounds", n, 4), ca.MX.sym("dt"), ca.MX.sym("clear")
     model = _Models(packed, horizon, n, dt)
     states = [x]
     for k in range(horizon):
@@ -154,10 +155,11 @@ def checking(horizon: int, n: int, models: int) -> Any:
     pull = of_rates + of_changes - ca.vertcat(of_changes[n:], ca.DM.zeros(n))
     hessian = ca.MX(ca.Sparsity.upper(size), upper_triangle)
     dual = ca.norm_inf(ca.triu2symm(hessian) @ u + q + pull)
-    arguments = [packed, x, inputs, y, upper_triangle, q, lower, upper, bounds, dt]
-    graph = ca.Function(
-        "check",
-        arguments,
-        [ca.horzcat(*states), ca.vertcat(primal, dual, excess, ca.norm_inf(of_rates), ca.norm_inf(of_changes))],
-    )
+    # The first rows of rates, changes and angles; so written that NaN keeps nothing.
+    first = [slice(k * size, k * size + n) for k in range(3)]
+    kept = ca.vertcat(*(row for at in first[:2] for row in (lower[at] <= u[:n], u[:n] <= upper[at])),
+                      lower[first[2]] <= -clear, upper[first[2]] >= clear)  # fmt: skip
+    numbers = primal, dual, excess, ca.norm_inf(of_rates), ca.norm_inf(of_changes), ca.mmin(kept)
+    arguments = [packed, x, upper_triangle, q, lower, upper, bounds, dt, clear, inputs, y]
+    graph = ca.Function("check", arguments, [ca.horzcat(*states), ca.vertcat(*numbers)])
     return graph.expand("check", {"cse": True}) if horizon <= _UNROLLED else graph

@@ -11,6 +11,7 @@ answer (residuals are computed from the data, and decide).
 
 from __future__ import annotations
 
+import math
 import time
 
 import daqp
@@ -170,7 +171,7 @@ class DAQPSolver(CheckedQP):
     def solve(self, most: int | None = None, *, certified: bool = True) -> Solution:
         """Solve the current data, in at most ``most`` iterations if that is less than ``max_iterations``.
 
-        It is always ``certified``, for it is judged by its residuals.
+        Unless it is to be ``certified``, the residuals are left to the caller, who must `judge` by them.
 
         Raises
         ------
@@ -196,12 +197,20 @@ class DAQPSolver(CheckedQP):
             status = "primal infeasible" if flag in _INFEASIBLE else _STATUS.get(flag, f"DAQP's exit {flag}")
             raise self._unsolved(status, iterations, spent, self._worst_row() if flag in _INFEASIBLE else None)
         x, y = self._whole(core, info["lam"])
-        primal, dual = self._residuals(x, y)
-        if max(primal, dual) > self._tolerance and not self._accepted(x, y, primal, dual):
+        if not certified:
+            return Solution(x, y, iterations, spent, math.nan, math.nan)
+        solution = Solution(x, y, iterations, spent, *self._residuals(x, y))
+        self.judge(solution)
+        return solution
+
+    def judge(self, solution: Solution) -> None:
+        """Accept a solution by its residuals, or raise `InfeasibleError`."""
+        x, y, iterations, spent, primal, dual = solution
+        # So written that NaN is not accepted.
+        if not max(primal, dual) <= self._tolerance and not self._accepted(x, y, primal, dual):
             self._forget()
             raise self._unsolved(f"solved inaccurate, residuals {primal:.2g} and {dual:.2g}", iterations, spent, None)
         self._y = y[: self._rows]
-        return Solution(x, y, iterations, spent, primal, dual)
 
     def _forget(self) -> None:
         """Let no row of an unsolved problem be active in the next."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,8 +25,7 @@ _TOLERANCE = 10.0  # times the tuning's: the rows are scaled, and the inputs sti
 _SLACK_SEEN = 1e-4  # rad or units of a row: less is the solver's tolerance
 
 
-@dataclass(frozen=True, eq=False)
-class Limited:
+class Limited(NamedTuple):
     """A solution and what it cost in limits.
 
     Attributes
@@ -34,6 +33,8 @@ class Limited:
     inputs : ndarray, shape (N n,)
     states : ndarray, shape (N + 1, 4 + n), or None
         That it leads to, where they were needed to find it.
+    kept : bool
+        The first inputs keep all limits of motors for certain.
     slack : dict
         By how much limits had to give, by kind, in their own units.
     active : tuple of str
@@ -44,6 +45,7 @@ class Limited:
 
     inputs: np.ndarray
     states: np.ndarray | None
+    kept: bool
     slack: dict[str, float]
     active: tuple[str, ...]
     solution: Solution
@@ -176,6 +178,7 @@ class LimitedQP:
         return Limited(
             inputs,
             None,
+            False,
             self._slack(self._dt * given * length[2 * size :], limits),
             active_kinds(solution.y, self._groups),
             solution,

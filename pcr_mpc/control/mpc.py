@@ -188,11 +188,11 @@ class LinearMPC:
         """
         assert self._workspace is not None
         n = len(u_previous)
-        problem = self.limits, *qp.sizes[:2]
-        if not self._continues(*problem):
+        hessian, gradient, _ = qp.sizes.tolist()
+        if not self._continues(self.limits, hessian, gradient):
             self._forget()
         warm = None if self._last is None or self._problem is None else _shifted(self._last.inputs).ravel()
-        self._problem = problem
+        self._problem = self.limits, hessian, gradient
         updated = time.perf_counter()
         status, fallback = "solved", None
         try:
@@ -208,28 +208,29 @@ class LinearMPC:
         if answer.slack and fallback is None:
             status, fallback = f"cannot keep {', '.join(answer.slack)}", "softened"
         solved = time.perf_counter()
-        inputs = answer.inputs.reshape(-1, n)
-        # OSQP keeps limits to its tolerance and within its horizon, this keeps them exactly and ever after.
-        first_rates = self.limits.kept(inputs[0], u_previous, x[4:], models.dt)
-        states = answer.states
-        if states is None or inputs[0].tolist() != first_rates.tolist():
-            inputs[0] = first_rates
-            states = self._workspace.check.states(x, models, inputs)
+        inputs, states = answer.inputs.reshape(-1, n), answer.states
+        if not answer.kept:
+            # OSQP keeps limits to its tolerance and within its horizon, this keeps them exactly and ever after.
+            first_rates = self.limits.kept(inputs[0], u_previous, x[4:], models.dt)
+            if states is None or inputs[0].tolist() != first_rates.tolist():
+                inputs[0] = first_rates
+                states = self._workspace.check.states(x, models, inputs)
         self._age = 0
-        self._last = Plan(
+        solution = answer.solution
+        self._last = Plan.found(
             inputs=inputs,
             states=states,
-            models=models if told is None else told,
+            models=models.copy() if told is None else told,
             status=status,
             fallback=fallback,
             active=answer.active,
             slack=answer.slack,
-            iterations=answer.solution.iterations,
-            primal_residual=answer.solution.primal_residual,
-            dual_residual=answer.solution.dual_residual,
+            iterations=solution.iterations,
+            primal_residual=solution.primal_residual,
+            dual_residual=solution.dual_residual,
             update_time=updated - began,
             solve_time=solved - updated,
-            solver_time=answer.solution.run_time,
+            solver_time=solution.run_time,
         )
         return self._last
 
@@ -328,4 +329,6 @@ def _another_robot(one: LinearModel, other: LinearModel) -> bool:
 
 
 def _shifted(inputs: np.ndarray) -> np.ndarray:
-    return np.concatenate([inputs[1:], inputs[-1:]])
+    shifted = np.empty_like(inputs)
+    shifted[:-1], shifted[-1] = inputs[1:], inputs[-1]
+    return shifted

@@ -53,10 +53,6 @@ class DisturbanceObserver:
 
     Attributes
     ----------
-    x : ndarray, shape (4 + n,)
-        Estimate of the state.
-    force : ndarray, shape (2,)
-        Estimate of the unknown force [N].
     gain : ndarray, shape (6, 2)
         What a surprise in the tip position says about [p, v, d].
     half_step : float
@@ -68,12 +64,34 @@ class DisturbanceObserver:
         self.gain = _gain(tuning, max(tip_noise, tuning.tip_noise), model)
         self.half_step = angle_step / 2
         self._correct = BufferedFunction(correction(n))
-        self.x = np.zeros(4 + n)
-        self.force = np.zeros(2)
+        self._memory = np.zeros(6 + n)
+
+    @property
+    def x(self) -> np.ndarray:
+        """Estimate of the state, shape (4 + n,)."""
+        return self._memory[:-2]
+
+    @x.setter
+    def x(self, value: np.ndarray) -> None:
+        self._memory[:-2] = value
+
+    @property
+    def force(self) -> np.ndarray:
+        """Estimate of the unknown force, shape (2,) [N]."""
+        return self._memory[-2:]
+
+    @force.setter
+    def force(self, value: np.ndarray) -> None:
+        self._memory[-2:] = value
+
+    def live_in(self, memory: np.ndarray) -> None:
+        """Keep the estimate, [x, force], in memory that a graph reads, shape (6 + n,)."""
+        memory[:] = self._memory
+        self._memory = memory
 
     def start(self, x: np.ndarray) -> None:
         """Begin at a known state, without a force."""
-        self.x, self.force = x.copy(), np.zeros(2)
+        self.x, self.force = x, np.zeros(2)
 
     def correct(self, p: np.ndarray | None, q: np.ndarray | None) -> None:
         """Take in a measurement of the tip [m] and the motor angles [rad]; None: there is none.
@@ -81,19 +99,15 @@ class DisturbanceObserver:
         An encoder says in which interval the angle is; within it the prediction, which knows the commands, is better.
         """
         estimate, measured, gain, half_step = self._correct.inputs
-        estimate[:-2], estimate[-2:] = self.x, self.force
+        estimate[:] = self._memory
         measured[:2], measured[2:] = self.x[:2] if p is None else p, self.x[4:] if q is None else q
         gain[:], half_step[:] = self.gain, self.half_step
         self._correct()
-        self.take(self._correct.outputs[0])
+        self._memory[:] = self._correct.outputs[0]
 
-    def take(self, corrected: np.ndarray) -> None:
-        """Take over a state and force that `correction` has found."""
-        self.x, self.force = corrected[:-2].copy(), corrected[-2:].copy()
-
-    def move(self, p: np.ndarray, v: np.ndarray) -> None:
+    def move(self, p: Any, v: Any) -> None:
         """Begin anew with the tip elsewhere, at position p [m] and velocity v [m/s], and no force suspected."""
-        self.x[:2], self.x[2:4], self.force = p, v, np.zeros(2)
+        self._memory[:2], self._memory[2:4], self._memory[-2:] = p, v, 0.0
 
     def predict(self, model: LinearModel, u: np.ndarray) -> None:
         """Move on by one period in which the rates u are applied; ``model`` must know the force."""

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from .qp_solver import CheckedQP, Solution
 
 _RHO = 0.1
+_SOLVED = int(osqp.SolverStatus.OSQP_SOLVED)
 
 
 class QPSolver(CheckedQP):
@@ -50,8 +51,13 @@ class QPSolver(CheckedQP):
 
     def _set_up(self) -> None:
         # A new one: OSQP scales and unscales A at every update of P, and its rounding would stay.
-        n, m = self.n, self.m
         self._osqp, self._allowed = osqp.OSQP(), self._most
+        self._set_up_core()
+        # Its own object, without the wrapper that looks at every argument again.
+        self._core = self._osqp._solver
+
+    def _set_up_core(self) -> None:
+        n, m = self.n, self.m
         if self._identity:
             self._osqp.setup(sp.identity(n, format="csc"), np.zeros(n), self._matrix, -np.ones(m), np.ones(m),
                              **self._settings)  # fmt: skip
@@ -64,7 +70,7 @@ class QPSolver(CheckedQP):
         self._osqp.setup(hessian, np.zeros(n), self._matrix, -np.ones(m), np.ones(m), **self._settings)
 
     def _start_from(self, x: np.ndarray, y: np.ndarray | None) -> None:
-        self._require(self._osqp.warm_start(x, y), "warm_start")
+        self._require(self._core.warm_start(x, y), "warm_start")
 
     def _hand_over(
         self,
@@ -74,12 +80,12 @@ class QPSolver(CheckedQP):
         u: np.ndarray,
         A: np.ndarray | None,
     ) -> None:
-        core = self._osqp._solver
-        if (P is not None or A is not None) and core.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
+        core = self._core
+        if (P is not None or A is not None) and core.update_data_mat(P, None, A, None):
             # OSQP keeps the refused P, and would say "solved" of a mixture.
             self.reset()
             raise self._not_convex("P has a negative eigenvalue")
-        self._require(core.update_data_vec(q=q, l=l, u=u), "update_data_vec")
+        self._require(core.update_data_vec(q, l, u), "update_data_vec")
 
     def solve(self, most: int | None = None, *, certified: bool = True) -> Solution:
         """Solve the current data, in at most ``most`` iterations if that is less than ``max_iterations``.
@@ -94,25 +100,26 @@ class QPSolver(CheckedQP):
             OSQP's status is anything but "solved"; ``status`` says what, ``iterations`` how far it got, ``limit``
             which row stands most in the way if the problem is infeasible.
         """
-        core = self._osqp._solver
+        core = self._core
         allowed = self._allowed_of(most)
         if allowed != self._allowed:
             self._osqp.update_settings(max_iter=allowed)
             self._allowed = allowed
         core.solve()
         info = core.info
-        if info.status_val != osqp.SolverStatus.OSQP_SOLVED:
+        if info.status_val != _SOLVED:
             status, iterations, limit = info.status, int(info.iter), None
             if info.status_val == osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE:
                 # The row that weighs most in the proof that no point meets all bounds.
                 limit = int(np.argmax(np.abs(core.solution.prim_inf_cert)))
             # An unsolved problem's iterate and step size must not start the next one.
-            self._require(self._osqp.warm_start(np.zeros(self.n), np.zeros(self.m)), "warm_start")
+            self._require(core.warm_start(np.zeros(self.n), np.zeros(self.m)), "warm_start")
             self._osqp.update_settings(rho=self._settings["rho"])
             raise self._unsolved(status, iterations, float(info.run_time), limit)
-        x, y = np.array(core.solution.x), np.array(core.solution.y)
+        found = core.solution
+        x, y = np.array(found.x), np.array(found.y)
         primal, dual = self._residuals(x, y) if certified else (np.nan, np.nan)
-        return Solution(x, y, int(info.iter), float(info.run_time), primal, dual)
+        return Solution(x, y, info.iter, info.run_time, primal, dual)
 
     @staticmethod
     def _require(code: int | None, call: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -51,8 +50,10 @@ class QuadraticProgram:
         same for every QP (see `constraint_matrix`).
     l, u : ndarray, shape (3 N n,)
         Bounds.
-    sizes : (float, float, float), optional
+    sizes : ndarray, shape (3,), optional
         ``|P|``, ``|q|``, and 1 if all entries are finite and no bounds cross, as the graph that made them has found.
+    block : ndarray, optional
+        Linear models, state, P, q, l and u one after the other, where they are parts of one memory.
     """
 
     P: np.ndarray
@@ -60,7 +61,8 @@ class QuadraticProgram:
     A: sp.csc_matrix
     l: np.ndarray  # noqa: E741  OSQP's name
     u: np.ndarray
-    sizes: tuple[float, float, float] = (math.nan, math.nan, 0.0)
+    sizes: np.ndarray = field(default_factory=lambda: np.array([np.nan, np.nan, 0.0]))
+    block: np.ndarray | None = None
 
 
 def build_qp(
@@ -125,8 +127,7 @@ def assemble(
     bounds[:] = motor_bounds(limits)
     dt[0] = models.dt
     function()
-    p, q, lower, upper = (output.copy() for output in function.outputs[:4])
-    sizes = tuple(function.outputs[4].tolist())
+    p, q, lower, upper, sizes = (output.copy() for output in function.outputs)
     return QuadraticProgram(p, q, constraint_matrix(tuning.horizon, n), lower, upper, sizes)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,8 +15,7 @@ from ..errors import InfeasibleError
 INFINITY = 1e30  # of OSQP and of DAQP
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(NamedTuple):
     """A solved QP.
 
     Attributes
@@ -79,7 +78,7 @@ class CheckedQP(ABC):
     def solve(self, most: int | None = None, *, certified: bool = True) -> Solution:
         """Solve the current data, in at most ``most`` iterations if that is less than ``max_iterations``.
 
-        Unless it is to be ``certified``, residuals that the solver does not need may be left to the caller: NaN.
+        Unless it is to be ``certified``, the residuals are left to the caller: they are NaN, and `judge` wants them.
 
         Raises
         ------
@@ -105,8 +104,17 @@ class CheckedQP(ABC):
     def _start_from(self, x: np.ndarray, y: np.ndarray | None) -> None:
         """Give a checked start to the solver."""
 
-    def warm_start(self, x: np.ndarray, y: np.ndarray | None = None) -> None:
-        """Start the next solve from x, shape (n,), and multipliers y, shape (m,); None keeps the last ones."""
+    def judge(self, solution: Solution) -> None:  # noqa: B027  most solvers have judged themselves
+        """Accept a solution whose residuals the caller has computed, or raise `InfeasibleError`."""
+
+    def warm_start(self, x: np.ndarray, y: np.ndarray | None = None, *, sound: bool = False) -> None:
+        """Start the next solve from x, shape (n,), and multipliers y, shape (m,); None keeps the last ones.
+
+        ``sound``: x comes from a solution, and is not checked.
+        """
+        if sound and y is None:
+            self._start_from(x, None)
+            return
         y = None if y is None else _checked("y", y, self.m)
         self._start_from(_checked("x", x, self.n), y)
 
@@ -132,7 +140,7 @@ class CheckedQP(ABC):
         A : ndarray, shape (stored entries of A,), optional
             Column by column, in the order of the first A. None: as they are.
         sound : bool
-            The graph that made P, q, l and u has checked them, and they are copied as they are.
+            The graph that made P, q, l and u has checked them; they stay as they are until the next update.
 
         Raises
         ------
@@ -143,7 +151,6 @@ class CheckedQP(ABC):
             lost, and good ones are needed before it solves again.
         """
         if sound and P is not None and A is None:
-            P, q, l, u = P.copy(), q.copy(), l.copy(), u.copy()  # noqa: E741
             self._hand_over(P, q, l, u, None)
             self._data = P, q, l, u
             return

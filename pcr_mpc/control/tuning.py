@@ -234,7 +234,7 @@ class Limits(Frozen):
         """
         if room < 0.0:
             return min(0.0, most_room)
-        if room >= self._clear:
+        if room >= self.clear:
             return self.rate
         if math.isinf(self.rate_change):
             return room
@@ -242,8 +242,8 @@ class Limits(Frozen):
         return room / (steps + 1) + self.rate_change * steps / 2.0
 
     @cached_property
-    def _clear(self) -> float:
-        """Way over dt from which even the greatest rate can be braked [rad/s]."""
+    def clear(self) -> float:
+        """Way to a stop, over dt, from which even the greatest rate can be braked [rad/s]."""
         if math.isinf(self.rate) or math.isinf(self.rate_change):
             return self.rate
         steps = math.floor(self.rate / self.rate_change)

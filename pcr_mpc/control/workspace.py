@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 
 from ..buffered import BufferedFunction
@@ -17,7 +14,6 @@ from .daqp_solver import DAQPSolver
 from .limited_qp import Limited, LimitedQP, active_of
 from .osqp_solver import QPSolver
 from .qp import QuadraticProgram, constraint_matrix, motor_bounds
-from .qp_solver import Solution
 from .tuning import Limits, Tuning, time_unit
 
 _RATES = ("rate", "rate change")
@@ -83,28 +79,30 @@ class Workspace:
         whole is solved at once.
         """
         self._spent, self._inside = 0, 0.0
+        check, solver = self.check.loaded(qp, x, models, limits), self._rates_only
         if not self._limits_matter:
-            n_rates, rate = self._rates_only.m, self._rate
+            rate, plain = self._rate, self._rate == 1.0
             try:
-                lower, upper = qp.l[:n_rates] / rate, qp.u[:n_rates] / rate
-                self._rates_only.update(rate**2 * qp.P, rate * qp.q, lower, upper, sound=qp.sizes[2] > 0.0)
+                solver.update(*check.problem(rate), sound=qp.sizes[2] > 0.0)
                 if warm is not None:
-                    self._rates_only.warm_start(warm / rate)
-                found = self._rates_only.solve(certified=False)
+                    solver.warm_start(warm if plain else warm / rate, sound=True)
+                found = solver.solve(certified=False)
+                inputs, y = (found.x, found.y) if plain else (rate * found.x, found.y / rate)
+                primal, dual, broken, of_rates, of_changes, kept = check(inputs, y)
+                found = found._replace(primal_residual=primal / rate, dual_residual=rate * dual)
+                solver.judge(found)
             except InfeasibleError as error:
                 self._count(error)
             else:
-                inputs, y = rate * found.x, found.y / rate
-                states, primal, dual, broken, *pulls = self.check(x, models, inputs, y, qp, limits)
-                solution = Solution(inputs, y, found.iterations, found.run_time, primal / rate, rate * dual)
+                states, solution = check.states(), found if plain else found._replace(x=inputs, y=y)
                 if pose_limits is not None:
                     rows = states[1:] @ pose_limits.C.T
                     broken = max(
                         broken, float((pose_limits.lower - rows).max()), float((rows - pose_limits.upper).max())
                     )
-                if broken <= self._tuning.tolerance * self._rate * self.dt:
-                    active = active_of({kind: rate * pull for kind, pull in zip(_RATES, pulls, strict=True)})
-                    return Limited(inputs, states, {}, active, solution)
+                if broken <= self._tuning.tolerance * rate * self.dt:
+                    active = active_of({_RATES[0]: rate * of_rates, _RATES[1]: rate * of_changes})
+                    return Limited(inputs, states, kept > 0.0, {}, active, solution)
                 self._spent, self._inside, warm = solution.iterations, solution.run_time, inputs
         return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
 
@@ -140,8 +138,8 @@ class Workspace:
         self._spent += answer.solution.iterations
         self._inside += answer.solution.run_time
         self._limits_matter = not set(answer.active) <= {*_RATES}
-        solution = replace(answer.solution, iterations=self._spent, run_time=self._inside)
-        return replace(answer, solution=solution)
+        solution = answer.solution._replace(iterations=self._spent, run_time=self._inside)
+        return answer._replace(solution=solution)
 
     def _count(self, error: InfeasibleError) -> None:
         self._spent += error.details.get("iterations", 0)
@@ -161,37 +159,75 @@ class Check:
 
     def __init__(self, horizon: int, n: int, *, compiled: bool = False) -> None:
         self._horizon, self._n, self._compiled = horizon, n, compiled
-        self._graphs: dict[int, BufferedFunction] = {}
-        self._limits: Limits | None = None
+        self._loaded: dict[int, Loaded] = {}
 
-    def __call__(
-        self, x: np.ndarray, models: LinearModels, inputs: np.ndarray, multipliers: np.ndarray, qp: QuadraticProgram,
-        limits: Limits,
-    ) -> tuple[Any, ...]:  # fmt: skip
-        """States, shape (N + 1, 4 + n), residuals of rows and gradient, excess of an angle [rad], and the
-        largest multipliers of rates and of changes."""
-        graph = self._graph(len(models))
-        _, _, _, y, p, q, lower, upper, bounds, _ = graph.inputs
-        y[:], p[:], q[:], lower[:], upper[:] = multipliers, qp.P, qp.q, qp.l, qp.u
-        if limits is not self._limits:
-            self._limits, self._bounds = limits, motor_bounds(limits)
-        bounds[:] = self._bounds
-        states = self.states(x, models, inputs)
-        return states, *graph.outputs[1].tolist()
+    def loaded(self, qp: QuadraticProgram, x: np.ndarray, models: LinearModels, limits: Limits) -> Loaded:
+        """Take over a problem whose answers are to be judged; one model or N of them."""
+        loaded = self._for(models)
+        loaded.load(qp, x, models, limits)
+        return loaded
 
     def states(self, x: np.ndarray, models: LinearModels, inputs: np.ndarray) -> np.ndarray:
         """States at the ends of the periods, x first, shape (N + 1, 4 + n); one model or N of them."""
-        graph = self._graph(len(models))
-        columns, start, rates = graph.inputs[:3]
-        columns.reshape(models.columns.shape, order="F")[:] = models.columns
-        start[:] = x
-        rates.reshape((self._n, -1), order="F")[:] = inputs.reshape((-1, self._n)).T
-        graph.inputs[-1][:] = models.dt
-        graph()
-        return graph.outputs[0].T.copy()
+        return self._for(models).predict(x, models, inputs)
 
-    def _graph(self, models: int) -> BufferedFunction:
-        if models not in self._graphs:
-            graph = fastest(checking(self._horizon, self._n, models), self._compiled)
-            self._graphs[models] = BufferedFunction(graph)
-        return self._graphs[models]
+    def _for(self, models: LinearModels) -> Loaded:
+        count = len(models)
+        if count not in self._loaded:
+            graph = fastest(checking(self._horizon, self._n, count), self._compiled)
+            self._loaded[count] = Loaded(BufferedFunction(graph))
+        return self._loaded[count]
+
+
+class Loaded:
+    """The graph of a `Check` and its memory, in which a problem lies as long as no other is loaded."""
+
+    def __init__(self, graph: BufferedFunction) -> None:
+        self._graph = graph
+        self._models, self._x, *parts, self._bounds, self._dt, self._clear, rates, self._y = graph.inputs
+        self._parts = p, q, lower, upper = parts
+        self._block = graph.memory_in[: sum(view.size for view in (self._models, self._x, *parts))]
+        self._rates = rates.T.reshape(-1)
+        self._states, self._numbers = graph.outputs[0].T, graph.outputs[1]
+        self._limits: Limits | None = None
+        self._problem = p, q, lower[: len(self._y)], upper[: len(self._y)]
+
+    def load(self, qp: QuadraticProgram, x: np.ndarray, models: LinearModels, limits: Limits) -> None:
+        """Take over a problem, in one copy where it is one block."""
+        if qp.block is None:
+            self._load_models(x, models)
+            for part, value in zip(self._parts, (qp.P, qp.q, qp.l, qp.u), strict=True):
+                part[:] = value
+        else:
+            self._block[:] = qp.block
+        if limits is not self._limits:
+            self._limits, self._bounds[:], self._clear[:] = limits, motor_bounds(limits), limits.clear
+            self._dt[:] = models.dt
+
+    def problem(self, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """P, q, and the bounds of rates and changes, for rates in this unit [rad/s]; where it is one, as they lie."""
+        p, q, lower, upper = self._problem
+        return self._problem if rate == 1.0 else (rate**2 * p, rate * q, lower / rate, upper / rate)
+
+    def _load_models(self, x: np.ndarray, models: LinearModels) -> None:
+        self._models.reshape(models.columns.shape, order="F")[:] = models.columns
+        self._x[:], self._dt[:] = x, models.dt
+
+    def __call__(self, inputs: np.ndarray, y: np.ndarray) -> list[float]:
+        """Residuals of rows and gradient, excess of an angle [rad], the largest multipliers of rates and of changes,
+        and 1 if the first rates keep the limits as they are, of an answer to the problem that was loaded."""
+        self._rates[:], self._y[:] = inputs, y
+        self._graph()
+        found: list[float] = self._numbers.tolist()
+        return found
+
+    def states(self) -> np.ndarray:
+        """States of the last answer at the ends of the periods, x first, shape (N + 1, 4 + n)."""
+        return self._states.copy()
+
+    def predict(self, x: np.ndarray, models: LinearModels, inputs: np.ndarray) -> np.ndarray:
+        """States to which other inputs lead from x."""
+        self._load_models(x, models)
+        self._rates[:] = inputs.ravel()
+        self._graph()
+        return self.states()

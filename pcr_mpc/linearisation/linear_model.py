@@ -88,7 +88,10 @@ class LinearModels(Sequence[LinearModel]):
 
     def copy(self) -> LinearModels:
         """The same, in memory of their own."""
-        return LinearModels(self.columns.copy(order="F"), self.dt, self.force.copy())
+        new = object.__new__(LinearModels)  # its size is known
+        new.columns, new.dt, new.force = self.columns.copy(order="F"), self.dt, self.force.copy()
+        new._n_states = self._n_states
+        return new
 
     @property
     def n(self) -> int:

@@ -102,6 +102,11 @@ class LimitWatch(Remade):
         if limits.stiffness is not None:
             self._curvature = BufferedFunction(elastica.rod_curvature())
 
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to watch."""
+        return not self._present
+
     def combinations(self) -> list[tuple[str, ...]]:
         """Every ``kinds`` that `rows` may give."""
         return [

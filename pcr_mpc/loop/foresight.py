@@ -10,6 +10,7 @@ import numpy as np
 
 from ..buffered import BufferedFunction
 from ..compiled import fastest, has_compiler
+from ..control.qp import QuadraticProgram, Reference, constraint_matrix
 from ..errors import ConvergenceError, PCRError
 from ..linearisation.linear_model import LinearModels
 from ..linearisation.linearise import linearise
@@ -34,12 +35,14 @@ class Outlook:
         Of the rods there (see `warm_calls`).
     shift : ndarray, shape (n,)
         Added to the angles of the reference [rad].
-    states : ndarray, shape (N, 4 + n)
-        The reference with that.
+    reference : Reference
+        Over the horizon, with the shift and the observed force.
+    reckoned : ndarray, shape (n,)
+        Where the commands have led [rad].
     signs : ndarray
         See `LimitWatch.far`.
-    qp : list of ndarray
-        P, q, l, u and sizes, if wanted (see `condensing`).
+    qp : QuadraticProgram or None
+        None: none was wanted.
     """
 
     ahead: np.ndarray
@@ -48,9 +51,15 @@ class Outlook:
     models: LinearModels
     record: np.ndarray
     shift: np.ndarray
-    states: np.ndarray
+    reference: Reference
+    reckoned: np.ndarray
     signs: np.ndarray
-    qp: list[np.ndarray]
+    qp: QuadraticProgram | None
+
+    @property
+    def states(self) -> np.ndarray:
+        """The reference with the shift, shape (N, 4 + n)."""
+        return self.reference.states
 
 
 class Foresight:
@@ -76,8 +85,14 @@ class Foresight:
         Of the graph: what a caller writes before a call.
     rows : dict of str to ndarray
         Those of its inputs that have a column for each period or place: views with a row for each.
+    window : ndarray, shape (N, 6 + 2n)
+        The reference: states at the ends of the periods, rates in them, forces that the rods carry at their ends.
     corrected : ndarray, shape (6 + n,)
         State and force after the last measurement, also where the rods could not follow.
+    outlook : Outlook
+        Of the last call.
+    strayed : float
+        How far the sum of the commands is from the angles ahead [rad].
     """
 
     def __init__(
@@ -94,27 +109,46 @@ class Foresight:
         assert target.step_model is not None
         self._plant, self._target_plant, self.places, self._period = plant, target, places, period
         inline = not (compiled and has_compiler())
-        graph = foresight_graph(plant.step_model, target.step_model, places, condense, inline=inline)
-        self._graph = BufferedFunction(fastest(graph, compiled))
-        self.inputs = dict(zip(graph.name_in(), self._graph.inputs, strict=True))
-        self._outputs = dict(zip(graph.name_out(), self._graph.outputs, strict=True))
-        self.rows = {name: _rows(self.inputs[name]) for name in ("states", "inputs", "path", "on_the_way", "payloads")}
-        self._records, self._followed = _rows(self.inputs["records"]), _rows(self._outputs["followed"])
-        self.inputs["dt"][:] = period
-        self.inputs["target_numbers"][:] = target.numbers
-        found, first = self._outputs, places.delay
-        columns, force = found["models"].reshape(-1, places.count, order="F"), found["corrected"][-2:]
-        self.corrected = found["corrected"]
-        self._outlook = Outlook(
-            ahead=_column(found["places"], first),
+        function = foresight_graph(plant.step_model, target.step_model, places, condense, inline=inline)
+        self._graph = graph = BufferedFunction(fastest(function, compiled))
+        n, ends = plant.robot.n_rods, np.cumsum([view.size for view in graph.outputs]).tolist()
+        self.inputs = given = dict(zip(function.name_in(), graph.inputs, strict=True))
+        self._outputs = found = dict(zip(function.name_out(), graph.outputs, strict=True))
+        ends = dict(zip(found, ends, strict=True))
+        self.rows = {name: _rows(given[name]) for name in ("path", "on_the_way", "payloads")}
+        self.window = _rows(given["window"])
+        self.rows |= {"states": self.window[:, : 4 + n], "inputs": self.window[:, 4 + n : -2]}
+        given["end_force"] = self.window[-1, -2:]
+        given["dt"][:], given["target_numbers"][:] = period, target.numbers
+        # What the next period starts from: in it each place is where its neighbour is now.
+        names = "records", "target", "shift", "reckoned"
+        before = sum(view.size for name, view in zip(function.name_in(), graph.inputs, strict=True)
+                     if function.index_in(name) < function.index_in(names[0]))  # fmt: skip
+        self._memory = graph.memory_in[before : before + sum(given[name].size for name in names)]
+        self._next = graph.memory_out[ends["moved_reckoned"] - self._memory.size : ends["moved_reckoned"]]
+        self._records = _rows(given["records"])
+        self._decisions = found["decisions"]
+        self.corrected, self.strayed = found["corrected"], 0.0
+        force = self.corrected[-2:]
+        now, models = (LinearModels(found[name].reshape(len(found["models"]), -1, order="F"), period, force)
+                       for name in ("now", "models"))  # fmt: skip
+        qp = None
+        if condense is not None:
+            qp = QuadraticProgram(
+                found["P"], found["q"], constraint_matrix(places.horizon, n), found["l"], found["u"],
+                self._decisions[2:], graph.memory_out[ends["now"] : ends["u"]],
+            )  # fmt: skip
+        self.outlook = Outlook(
+            ahead=found["ahead"],
             arriving=found["arriving"],
-            now=LinearModels(columns[:, :1], period, force),
-            models=LinearModels(columns[:, first:], period, force),
-            record=_column(found["followed"], first),
+            now=(now if places.delay else models)[:1],
+            models=models,
+            record=_column(found["followed"], places.delay),
             shift=found["moved_shift"],
-            states=_rows(found["wanted"]),
+            reference=Reference(_rows(found["wanted"]), self.rows["inputs"], _rows(found["carried"])),
+            reckoned=found["moved_reckoned"],
             signs=found["signs"],
-            qp=[found[name] for name in ("P", "q", "l", "u", "sizes") if name in found],
+            qp=qp,
         )
 
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
@@ -124,7 +158,8 @@ class Foresight:
         self.inputs["numbers"][:] = self._plant.numbers
         self.inputs["mass"][:] = self._plant.mass(x[:2], x[4:])[0]
         self.inputs["target"][:] = self._target_plant.record
-        self.inputs["shift"][:] = 0.0
+        self.inputs["shift"][:], self.inputs["u_previous"][:] = 0.0, 0.0
+        self.inputs["reckoned"][:] = x[4:]
         self._records[:] = self._plant.record
 
     def pose(self, x: np.ndarray) -> Equilibrium:
@@ -133,8 +168,9 @@ class Foresight:
         return self._plant.equilibrium(x)
 
     def target_from(self, other: Foresight) -> None:
-        """Go on with the motor target of another one of the same robot."""
-        self.inputs["target"][:], self.inputs["shift"][:] = other.inputs["target"], other.inputs["shift"]
+        """Go on with the motor target, and the sum of the commands, of another one of the same robot."""
+        for name in ("target", "shift", "reckoned"):
+            self.inputs[name][:] = other.inputs[name]
 
     def __call__(self) -> Outlook:
         """Evaluate for the inputs, and keep the rods for the next period.
@@ -144,15 +180,16 @@ class Foresight:
         UnreachableError, ConvergenceError, UnstableError, ValueError
             As `linearise`, at one of the places; the rods are then where they were.
         """
-        good = self._outputs["good"]
         self._graph()
-        if good.min() < 1.0:
-            self._bring_along()
-        inputs, found = self.inputs, self._outputs
-        # In the next period each place is where its neighbour is now.
-        self._records[:-1], self._records[-1] = self._followed[1:], self._followed[-1]
-        inputs["target"][:], inputs["shift"][:] = found["followed_target"], found["moved_shift"]
-        return self._outlook
+        all_good, self.strayed, *_ = self._decisions.tolist()
+        if not all_good:
+            try:
+                self._bring_along()
+            except BaseException:
+                self.inputs["reckoned"][:] = self.outlook.reckoned
+                raise
+        self._memory[:] = self._next
+        return self.outlook
 
     def _bring_along(self) -> None:
         """Take the ladder for the rods that have not followed, one place after the other."""

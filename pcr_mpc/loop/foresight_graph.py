@@ -73,7 +73,10 @@ def foresight_graph(
     -------
     casadi.Function
         With named inputs and outputs; one column of ``followed`` (records) and ``models`` for each place. ``good`` is 1
-        for each place, and then for the motor target, whose rods have followed, else 0.
+        for each place, and then for the motor target, whose rods have followed, else 0. ``decisions`` are [the least of
+        ``good``, how far the sum of the commands is from the angles ahead [rad], and what `condensing` calls sizes].
+        What the next period starts from is, from the second record on, in the order of the inputs ``records`` to
+        ``reckoned``; from the models of the plan on, the outputs are those that `checking` takes in.
     """
     n, count = model.kind.n_rods, places.count
     size, of_target = sizes(model), sizes(target)
@@ -83,13 +86,12 @@ def foresight_graph(
         "on_the_way": ca.MX.sym("on_the_way", n, places.delay),
         "u_previous": ca.MX.sym("u_previous", n),
         "path": ca.MX.sym("path", 4 + n, places.models - 1),  # of the last plan, from the second place on
-        "states": ca.MX.sym("states", 4 + n, places.horizon),  # of the reference
-        "inputs": ca.MX.sym("inputs", n, places.horizon),
-        "end_force": ca.MX.sym("end_force", 2),  # that the rods carry at the end of the reference
+        "window": ca.MX.sym("window", 6 + 2 * n, places.horizon),  # of the reference: states, rates, forces on the rods
         "payloads": ca.MX.sym("payloads", 1, count),
         "records": ca.MX.sym("records", size.record, count),
         "target": ca.MX.sym("target", of_target.record),
         "shift": ca.MX.sym("shift", n),
+        "reckoned": ca.MX.sym("reckoned", n),  # where the commands have led, whatever was measured [rad]
         "carries": ca.MX.sym("carries"),  # 1: the motor target carries the observed force, 0: it stays
         "numbers": ca.MX.sym("numbers", model.kind.size),
         "target_numbers": ca.MX.sym("target_numbers", target.kind.size),
@@ -102,6 +104,7 @@ def foresight_graph(
         "dt": ca.MX.sym("dt"),
     }
     given = SimpleNamespace(**inputs)
+    given.states, given.inputs, given.forces = ca.vertsplit(given.window, [0, 4 + n, 4 + 2 * n, 6 + 2 * n])
     corrected = correction(n)(given.estimate, given.measured, given.gain, given.half_step)
     x, force = corrected[:-2], corrected[-2:]
     graph_of = model_list if inline else model_graph
@@ -117,19 +120,22 @@ def foresight_graph(
     records, models, good, states_of = (ca.horzcat(*columns) for columns in zip(*found, strict=True))
     shift, target_record, target_good = _shifted(target, given, force, n)
     states = given.states + ca.vertcat(ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon))
-    outputs = {
-        "good": ca.vertcat(good.T, target_good), "corrected": corrected, "arriving": arriving, "places": states_of,
-        "followed": records, "models": models, "signs": _signs(model, given, records[:, places.delay]),
-        "moved_shift": shift, "followed_target": target_record, "wanted": states,
-    }  # fmt: skip
+    reckoned, of_plan = given.reckoned + given.dt * given.u_previous, models[:, places.delay :]
+    qp: Any = [ca.MX(0, 1)] * 4
+    measures = ca.MX.zeros(3)
     if condense is not None:
-        of_plan = models[:, places.delay :]
-        outputs |= zip(
-            ("P", "q", "l", "u", "sizes"),
-            condense(of_plan, ahead, states, given.inputs, given.u_previous, given.weights, given.terminal,
-                     given.bounds, given.dt),
-            strict=True,
-        )  # fmt: skip
+        *qp, measures = condense(of_plan, ahead, states, given.inputs, given.u_previous, given.weights, given.terminal,
+                                 given.bounds, given.dt)  # fmt: skip
+    good = ca.vertcat(good.T, target_good)
+    outputs = {
+        "corrected": corrected, "arriving": arriving, "places": states_of, "wanted": states,
+        "carried": given.forces + force, "signs": _signs(model, given, records[:, places.delay]), "good": good,
+        "decisions": ca.vertcat(ca.mmin(good), ca.norm_inf(reckoned - ahead[4:]), measures),
+        "followed": records, "stays": records[:, -1], "followed_target": target_record, "moved_shift": shift,
+        "moved_reckoned": reckoned,
+        "now": models[:, : places.delay], "models": of_plan, "ahead": ahead, "P": qp[0], "q": qp[1], "l": qp[2],
+        "u": qp[3],
+    }  # fmt: skip
     return ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
 
 
@@ -178,7 +184,7 @@ def _shifted(target: StepModel, given: Any, force: Any, n: int) -> tuple[Any, An
     square = g @ g.T
     a, b, d = square[0, 0], square[0, 1], square[1, 1]
     determinant = a * d - b * b
-    missing = given.end_force + force + numbers.tip_mass * numbers.gravity - found
+    missing = given.forces[:, -1] + force + numbers.tip_mass * numbers.gravity - found
     step = g.T @ ca.vertcat(d * missing[0] - b * missing[1], a * missing[1] - b * missing[0]) / determinant
     step = step * ca.fmin(1, _LARGEST_STEP / ca.fmax(ca.norm_inf(step), 1e-300))
     moves = ca.logic_and(given.carries, ca.logic_and(good, determinant >= _SINGULAR * a * d))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from operator import le, sub
 
 import numpy as np
 
@@ -78,14 +79,15 @@ class Gate:
         self._reach = [(*rod.base, rod.length) for rod in robot.rods]
         self._near = _SURPRISE * float(robot.lengths.min()) + _DEVIATIONS * tip_noise
         self._turn = limits.rate * dt * (1 + 1e-9) + angle_step
-        self._lower, self._upper = limits.angle_lower - angle_step, limits.angle_upper + angle_step
+        self._lower = (limits.angle_lower - angle_step).tolist()
+        self._upper = (limits.angle_upper + angle_step).tolist()
         self._dt, self._wrapped = dt, wrapped
         self.start(np.zeros(robot.n_rods))
 
     def start(self, q: np.ndarray) -> None:
         """Begin with motors that are at the angles q [rad]."""
         self._tip, self._encoders = _Sensor(), _Sensor()
-        self._before = q
+        self._before = q.tolist()
         self._first = True
 
     def sift(self, k: int, x: np.ndarray, expected: np.ndarray, with_velocity: bool) -> Sifted:
@@ -108,53 +110,52 @@ class Gate:
             The very first measurement is in other units, or wrapped: degrees, millimetres, whole turns off.
         """
         found = Sifted()
-        p, q = x[:2], x[4:]
+        told, due = x.tolist(), expected.tolist()  # on a few floats Python is faster than NumPy
         if self._wrapped:
-            turns = np.zeros(len(q))
-            np.rint((expected[4:] - q) / _TURN, out=turns, where=np.isfinite(q))
-            q = q + _TURN * turns
-        angles_why, tip_why = self._odd_angles(q, expected[4:]), self._odd_tip(x, expected, with_velocity)
+            told[4:] = map(_unwrapped, told[4:], due[4:])
+        p, q = told[:2], told[4:]
+        angles_why, tip_why = self._odd_angles(q, due[4:]), self._odd_tip(told, due, with_velocity)
         if angles_why is None:
-            self._encoders.believed(max(map(abs, (q - expected[4:]).tolist())))  # faster than NumPy on a few floats
+            self._encoders.believed(max(map(abs, map(sub, q, due[4:]))))
             found.q = q
         else:
             text, unit = angles_why
             if self._first and unit:
                 raise MeasurementError(f"first measurement: {text}")
-            insists = self._encoders.refused(q.tolist(), self._turn)
-            if insists and not unit and ((q >= self._lower) & (q <= self._upper)).all():
+            insists = self._encoders.refused(q, self._turn)
+            if insists and not unit and all(map(le, self._lower, q)) and all(map(le, q, self._upper)):
                 found.q = q
                 found.note("reinitialised", k, f"{text}; told so {PATIENCE} times in a row, and believed now")
                 self._encoders.believed(self._turn)
             else:
                 found.note("measurement", k, f"{text}; bridged by the prediction")
         if tip_why is None:
-            self._tip.believed(math.hypot(*(p - expected[:2]).tolist()))
+            self._tip.believed(math.hypot(p[0] - due[0], p[1] - due[1]))
             found.p = p
         else:
             text, unit = tip_why
             if self._first and unit:
                 raise MeasurementError(f"first measurement: {text}")
             before = self._tip.last
-            insists = self._tip.refused(p.tolist(), 2 * self._near)
-            if insists and before is not None and not self._too_far(p, 0.0):
-                found.p, found.velocity = p, (p - np.array(before)) / self._dt
+            insists = self._tip.refused(p, 2 * self._near)
+            if insists and before is not None and not self._too_far(p[0], p[1], 0.0):
+                found.p, found.velocity = p, [(now - then) / self._dt for now, then in zip(p, before, strict=True)]
                 found.note("reinitialised", k, f"{text}; told so {PATIENCE} times in a row, and believed now")
                 self._tip.believed(self._near)
             else:
                 found.note("measurement", k, f"{text}; bridged by the prediction")
         self._first = False
-        self._before = expected[4:] if found.q is None else found.q
+        self._before = due[4:] if found.q is None else q
         return found
 
-    def _odd_tip(self, x: np.ndarray, expected: np.ndarray, with_velocity: bool) -> tuple[str, bool] | None:
+    def _odd_tip(self, x: list[float], expected: list[float], with_velocity: bool) -> tuple[str, bool] | None:
         """Why a tip is not to be believed, and whether other units explain it."""
-        px, py, vx, vy = x[:4].tolist()
-        ex, ey, evx, evy = expected[:4].tolist()
+        px, py, vx, vy, *_ = x
+        ex, ey, evx, evy, *_ = expected
         near = self._near + _TIP_ECHO * self._tip.surprise
         away = math.hypot(px - ex, py - ey)
         # So written that NaN is odd.
-        if away <= near and not self._too_far(x[:2], _TOO_LONG):
+        if away <= near and not self._too_far(px, py, _TOO_LONG):
             if not with_velocity or self._dt * math.hypot(vx - evx, vy - evy) <= near:
                 return None
             return f"tip velocity ({vx:.6g}, {vy:.6g}) m/s, expected ({evx:.6g}, {evy:.6g}) m/s", False
@@ -163,7 +164,7 @@ class Gate:
             return f"{text} is not finite", False
         if math.hypot(px / 1e3 - ex, py / 1e3 - ey) <= near:
             return f"{text}, expected ({ex:.6g}, {ey:.6g}) m: millimetres? give metres", True
-        far = self._too_far(x[:2], _TOO_LONG)
+        far = self._too_far(px, py, _TOO_LONG)
         if far:
             return f"{text} is out of reach: {far}", False
         return (
@@ -171,28 +172,28 @@ class Gate:
             False,
         )
 
-    def _too_far(self, p: np.ndarray, tolerance: float) -> str:
+    def _too_far(self, px: float, py: float, tolerance: float) -> str:
         """Which rod cannot reach p; empty if all can."""
-        px, py = p.tolist()
         for i, (x, y, length) in enumerate(self._reach):
             if not math.hypot(px - x, py - y) < length * (1.0 + tolerance):
                 return f"{math.hypot(px - x, py - y):.4g} m from the base of rod {i}, whose length is {length:.4g} m"
         return ""
 
-    def _odd_angles(self, q: np.ndarray, expected: np.ndarray) -> tuple[str, bool] | None:
+    def _odd_angles(self, q: list[float], expected: list[float]) -> tuple[str, bool] | None:
         """Why motor angles are not to be believed, and whether other units explain them."""
-        measured, before, turn = q.tolist(), self._before.tolist(), self._turn + _ANGLE_ECHO * self._encoders.surprise
+        turn = self._turn + _ANGLE_ECHO * self._encoders.surprise
+        jumps = list(map(sub, q, self._before))
         # So written that NaN is odd.
-        if all(abs(now - then) <= turn for now, then in zip(measured, before, strict=True)):
+        if all(abs(jump) <= turn for jump in jumps):
             return None
         text = f"motor angles {_listed(q)} rad"
-        if not np.isfinite(q).all():
+        if not all(map(math.isfinite, q)):
             return f"{text} are not finite", False
         text += f", expected {_listed(expected)} rad"
-        turns = np.round((q - self._before) / _TURN)
-        if turns.any() and (np.abs(q - _TURN * turns - self._before) <= turn).all():
+        turns = [_TURN * round(jump / _TURN) for jump in jumps]
+        if any(turns) and all(abs(jump - whole) <= turn for jump, whole in zip(jumps, turns, strict=True)):
             return f"{text}: angles jump by 2 pi: encoders that wrap? set [sensor] wrapped = true", True
-        if (np.abs(np.radians(q) - self._before) <= turn).all():
+        if all(abs(math.radians(now) - then) <= turn for now, then in zip(q, self._before, strict=True)):
             return f"{text}: degrees? give radians", True
         return f"{text}: the motors turn by at most {turn:.3g} rad in a period", False
 
@@ -202,20 +203,20 @@ class Sifted:
 
     Attributes
     ----------
-    p : ndarray, shape (2,), or None
+    p : list of 2 floats, or None
         Tip position [m].
-    velocity : ndarray, shape (2,), or None
+    velocity : list of 2 floats, or None
         Of the tip, where the estimate has to begin anew [m/s].
-    q : ndarray, shape (n,), or None
+    q : list of n floats, or None
         Motor angles [rad].
     events : tuple of dict
         What was not believed, and why: ``kind`` and ``message``.
     """
 
     def __init__(self) -> None:
-        self.p: np.ndarray | None = None
-        self.velocity: np.ndarray | None = None
-        self.q: np.ndarray | None = None
+        self.p: list[float] | None = None
+        self.velocity: list[float] | None = None
+        self.q: list[float] | None = None
         self.events: tuple[Event, ...] = ()
 
     def note(self, kind: str, k: int, message: str) -> None:
@@ -223,5 +224,10 @@ class Sifted:
         self.events += ({"kind": kind, "message": f"period {k}: {message}"},)
 
 
-def _listed(values: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.6g}" for value in values.tolist()) + ")"
+def _unwrapped(angle: float, expected: float) -> float:
+    """The angle by whole turns nearest to what is expected."""
+    return angle + _TURN * round((expected - angle) / _TURN) if math.isfinite(angle) else angle
+
+
+def _listed(values: list[float]) -> str:
+    return "(" + ", ".join(f"{value:.6g}" for value in values) + ")"

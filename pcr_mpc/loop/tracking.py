@@ -9,30 +9,39 @@ from typing import Any
 
 import numpy as np
 
-from ..control.laws import LQR, PD, FeedForward, Law
+from ..control.laws import Law
 from ..control.mpc import LinearMPC
-from ..control.nonlinear_mpc import NonlinearMPC
 from ..control.observer import DisturbanceObserver
 from ..control.plan import Plan
-from ..control.qp import QuadraticProgram, Reference, constraint_matrix, motor_bounds, stage_weights
-from ..control.tuning import SAME_ANGLE, Limits, Tuning
+from ..control.qp import Reference
+from ..control.tuning import SAME_ANGLE, Tuning
 from ..errors import PCRError, checked_period, measured_vector
 from ..frozen import Remade, set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel, LinearModels
 from ..linearisation.linearise import linearise
 from ..linearisation.pose_limits import LimitWatch
-from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
-from ..plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 from .controllers import Decision, HoldMotors
 from .feed_forward import InverseDynamics, feed_forward, held
 from .foresight import Foresight, Outlook
-from .foresight_graph import Places
-from .gate import Gate
+from .gate import Event
+from .parts import (
+    graph_of,
+    make_foresight,
+    make_gate,
+    make_law,
+    make_model,
+    make_observer,
+    motor_limits,
+    write_constants,
+)
 from .scene import Scene
 from .target import MotorTarget
+from .track import Track
+
+__all__ = ["TrackingController", "make_controller", "motor_limits"]
 
 
 @set_once("make a new controller with it", "robot", tuning="call retune, which lets all of it take effect")
@@ -68,16 +77,15 @@ class TrackingController(Remade):
         if reference is not None and len(reference.inputs) < needed:
             raise ValueError(f"reference has {len(reference.inputs)} periods; scene and horizon need {needed}")
         self._foresight: Foresight | None = None
-        self._watch = LimitWatch(scene.pose_limits, self._make_model())
+        self._watch = LimitWatch(scene.pose_limits, make_model(self.robot, tuning.model))
         self._limits = motor_limits(scene.robot, scene.period)
-        self._gate = self._make_gate()
+        self._gate = make_gate(scene, tuning, self.robot, self._limits)
         self._sent: deque[np.ndarray] = deque(maxlen=scene.delay)
         self._on_the_way: deque[np.ndarray] = deque()
         self._u = np.zeros(self.robot.n_rods)
         self._plan: Plan | None = None
         self._inverse = MotorTarget(self.robot)
         self._law: Law | None = None
-        self._end: InverseDynamics | None = None  # the last point of the reference, once it is held
 
     @property
     def reference(self) -> InverseDynamics:
@@ -86,11 +94,11 @@ class TrackingController(Remade):
 
     def start(self, pose: Equilibrium) -> None:
         """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
-        self._pose, self._end = pose, None
+        self._pose = pose
         self._invert_dynamics(self._known)
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         if self._law is None:
-            self._law = self._make_law(pose)
+            self._law = self._make_law()
         resting = self._rest()
         # One throw-away step pays for building graphs and workspaces before the clock runs.
         self._restart(x, pose, resting)
@@ -102,18 +110,18 @@ class TrackingController(Remade):
         assert self._law is not None
         self._law.reset()
         self._law.prepare(resting, self._watch.combinations())
-        self.observer = self._make_observer(resting)
-        if self.observer is not None:
-            self.observer.start(x)
+        self.observer = make_observer(self._told, self.tuning, resting)
         if self._foresight is None:
             self._foresight = self._make_foresight()
         self._foresight.reset(x, pose)
-        self._write_constants()
+        self._foresight.inputs["estimate"][:-2] = x
+        if self.observer is not None:
+            self.observer.start(x)
+        write_constants(self._foresight, self.tuning, self._law, self._limits, self.observer)
         self._watch.reset(x, pose)
         self._inverse.start(pose)
         self._gate.start(pose.q)
-        self._reckoned = pose.q  # where the commands so far lead, whatever is measured
-        self._predicts, self._next = LinearModels.of([resting]), x
+        self._predicts = LinearModels.of([resting])
         self._sent.extend([np.zeros(self.robot.n_rods)] * self._told.delay)
         self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
         self._u = np.zeros(self.robot.n_rods)
@@ -155,39 +163,40 @@ class TrackingController(Remade):
         self._known = None
         model_changed = tuning.model != old.model
         if model_changed:
-            self._watch = LimitWatch(self._told.pose_limits, self._make_model())
+            self._watch = LimitWatch(self._told.pose_limits, make_model(self.robot, tuning.model))
         if self._law is None or self._foresight is None:
             self._foresight = None
             return
-        here, last = self._expected(), self._foresight
+        last = self._foresight
+        here = last.inputs["estimate"][:-2].copy()
         needed = self._scene.n_periods + tuning.horizon + self._delay
         same_dynamics = (tuning.model.inertia, self._scene) == (old.model.inertia, scene)
-        if not same_dynamics or len(self._reference.inputs) < needed:
-            self._invert_dynamics(None)
+        known = self._reference if same_dynamics and len(self._reference.inputs) >= needed else None
+        self._invert_dynamics(known)
         resting = self._rest() if model_changed else self._resting
+        observer = self.observer
         if model_changed or tuning.observer != old.observer:
-            observer, self.observer = self.observer, self._make_observer(resting)
+            self.observer = make_observer(self._told, tuning, resting)
             if self.observer is not None:
                 self.observer.start(here)
                 if observer is not None:
-                    self.observer.force = observer.force.copy()
+                    self.observer.force = observer.force
         if self._delay != len(self._on_the_way):
             self._on_the_way = deque(list(self._sent)[len(self._sent) - self._delay :])
         if tuning.law == old.law and not model_changed:
             self._law.retune(tuning)
         else:
-            self._law = self._make_law(self._pose)
+            self._law = self._make_law()
             self._law.prepare(resting, self._watch.combinations())
-        if self._graph_of(tuning) == self._graph_of(old) and self._delay == last.places.delay:
-            self._write_constants()
-            return
-        pose = last.pose(here)
-        self._foresight = self._make_foresight()
-        self._foresight.reset(here, pose)
-        self._foresight.target_from(last)
-        self._write_constants()
-        if model_changed:
-            self._watch.reset(here, pose)
+        if graph_of(tuning) != graph_of(old) or self._delay != last.places.delay:
+            pose = last.pose(here)
+            self._foresight = self._make_foresight()
+            self._foresight.reset(here, pose)
+            self._foresight.target_from(last)
+            self._foresight.inputs["estimate"][:-2] = here
+            if model_changed:
+                self._watch.reset(here, pose)
+        write_constants(self._foresight, tuning, self._law, self._limits, self.observer)
 
     def step(self, k: int, x: Any) -> Decision:
         """See `Controller`; what cannot have been measured is bridged by the prediction, and told in an event.
@@ -212,147 +221,123 @@ class TrackingController(Remade):
             raise PCRError(f"controller {self.name} was not started: call start(pose) before the first step")
         k, x = checked_period("k", k), measured_vector("x", x, 4 + self.robot.n_rods)
         began = time.perf_counter()
-        foresight, observer, now = self._foresight, self.observer, self._expected()
-        found = self._gate.sift(k, x, now, observer is None)
-        if observer is None:
-            velocity = x[2:4] if found.velocity is None else found.velocity
-            now = np.concatenate([now[:4] if found.p is None else np.concatenate([found.p, velocity]), now[4:]])
-            if found.q is not None:
-                now[4:] = found.q
-        elif found.p is not None and found.velocity is not None:
-            observer.move(found.p, found.velocity)
-            now = observer.x
-        self._tell(k, now, found.p, found.q)
+        foresight = self._foresight
+        events = self._believe(k, x, foresight.inputs)
+        self._tell(k, foresight)
         failure, pose_limits, outlook = "", None, None
         try:
             outlook = foresight()
-            if not (self._watch.follows_model and self._watch.far(outlook.signs.tolist())):
+            if not self._watch.idle:
                 pose_limits = self._near(outlook)
         except (PCRError, ValueError) as error:
             if self.tuning.fallback == "raise":
                 raise
             failure, outlook = f"no linear model: {error}", None
-        corrected = foresight.corrected
-        if observer is not None:
-            observer.take(corrected)
-        estimate, force = corrected[:-2].copy(), corrected[-2:].copy()
+        corrected = foresight.corrected.copy()
+        estimate, force = corrected[:-2], corrected[-2:]
         linearised = time.perf_counter()
-        decided, ahead = self._decide(k, outlook, pose_limits, estimate, force, failure, linearised)
-        plan = self._within_stops(decided, ahead)
-        self._u, self._plan = plan.inputs[0], plan
-        self._reckoned = self._reckoned + self._scene.period * self._u
-        self._sent.append(self._u)
-        self._on_the_way.append(self._u)
+        if outlook is None:
+            decided, ahead = self._fall_back(failure, estimate, force, foresight), estimate
+        else:
+            decided, ahead = self._decide(outlook, pose_limits, linearised), outlook.ahead
+        plan = self._within_stops(decided, ahead, foresight)
+        self._u = u = plan.inputs[0]
+        self._plan = plan
+        self._sent.append(u)
+        self._on_the_way.append(u)
         arriving = self._on_the_way.popleft()
-        self._look_on(outlook, plan, estimate, arriving, foreseen=plan is decided and not self._delay)
-        return Decision(plan.inputs[0], plan, linearised - began, estimate, force, found.events)
+        here = self._look_on(outlook, plan, estimate, arriving, foreseen=plan is decided and not self._delay)
+        known = foresight.inputs["estimate"]
+        known[:-2], known[-2:] = here, force
+        return Decision(u, plan, linearised - began, estimate, force, events)
 
-    def _tell(self, k: int, now: np.ndarray, p: np.ndarray | None, q: np.ndarray | None) -> None:
-        """Write what is known in period k into the graph that looks ahead."""
-        assert self._foresight is not None
-        given, horizon, observer = self._foresight.inputs, self.tuning.horizon, self.observer
-        given["estimate"][:-2] = now
-        given["estimate"][-2:] = 0.0 if observer is None else observer.force
-        given["measured"][:2] = now[:2] if p is None else p
-        given["measured"][2:] = now[4:] if q is None else q
-        rows = self._foresight.rows
+    def _believe(self, k: int, x: np.ndarray, given: dict[str, np.ndarray]) -> tuple[Event, ...]:
+        """Write what is believed of a measurement; what is not is as expected."""
+        expected, observer = given["estimate"][:-2], self.observer
+        found = self._gate.sift(k, x, expected, observer is None)
+        if observer is None:
+            if found.p is not None:
+                expected[:2], expected[2:4] = found.p, x[2:4] if found.velocity is None else found.velocity
+            if found.q is not None:
+                expected[4:] = found.q
+        elif found.velocity is not None:
+            observer.move(found.p, found.velocity)
+        measured = given["measured"]
+        measured[:2] = expected[:2] if found.p is None else found.p
+        measured[2:] = expected[4:] if found.q is None else found.q
+        return found.events
+
+    def _tell(self, k: int, foresight: Foresight) -> None:
+        """Write the rest of what is known in period k into the graph that looks ahead."""
+        rows, track = foresight.rows, self._track
         for j, u in enumerate(self._on_the_way):
             rows["on_the_way"][j] = u
-        given["u_previous"][:] = self._u
-        reference, row = self._rows(k, k + self._delay)
-        rows["states"][:] = reference.states[row + 1 : row + 1 + horizon]
-        rows["inputs"][:] = reference.inputs[row : row + horizon]
-        given["end_force"][:] = reference.forces[row + horizon]
-        count = self._foresight.places.count
-        first = min(k, len(self._payloads) - count)
-        rows["payloads"][:, 0] = self._payloads[first : first + count]
-        if self._foresight.places.models > 1:
+        foresight.inputs["u_previous"][:] = self._u
+        foresight.window[:] = track.window(k, self._delay)
+        places = foresight.places
+        if track.carries:
+            rows["payloads"][:, 0] = track.payloads(k, places.count)
+        if places.models > 1:
             # The last plan, one period on; at the start, and beyond the end of a shorter plan, the reference.
-            reference, row = self._rows(k, k + self._delay + 1)
-            path = reference.states[row : row + horizon - 1]
-            if self._plan is not None and self._plan.states is not None:
-                known = self._plan.states[2:]
-                path = known if len(known) == len(path) else np.concatenate([known[: len(path)], path[len(known) :]])
-            rows["path"][:] = path
+            path = rows["path"]
+            known = None if self._plan is None else self._plan.states
+            if known is not None and len(known) == len(path) + 2:
+                path[:] = known[2:]
+            else:
+                path[:] = rows["states"][:-1]
+                if known is not None:
+                    path[: len(known) - 2] = known[2 : 2 + len(path)]
 
     def _near(self, outlook: Outlook) -> LinearLimits | None:
         """Limits of the pose ahead that are near."""
         if self._watch.follows_model:
+            if self._watch.far(outlook.signs.tolist()):
+                return None
             self._watch.recall(outlook.record)
         return self._watch.rows(outlook.ahead.copy())
 
-    def _decide(
-        self,
-        k: int,
-        outlook: Outlook | None,
-        pose_limits: LinearLimits | None,
-        estimate: np.ndarray,
-        force: np.ndarray,
-        failure: str,
-        began: float,
-    ) -> tuple[Plan, np.ndarray]:
-        """The law's plan, and the state from which it starts."""
+    def _decide(self, outlook: Outlook, pose_limits: LinearLimits | None, began: float) -> Plan:
+        """The law's plan."""
+        law, ahead, models, window = self._law, outlook.ahead, outlook.models, outlook.reference
+        assert law is not None
+        if isinstance(law, LinearMPC):
+            assert outlook.qp is not None
+            return law.decide(outlook.qp, ahead, models, window, self._u, pose_limits, began)
+        return law.solve(ahead.copy(), models.copy(), window, self._u, pose_limits)
+
+    def _fall_back(self, failure: str, estimate: np.ndarray, force: np.ndarray, foresight: Foresight) -> Plan:
+        """The law's plan where there are no linear models."""
         assert self._law is not None
-        assert self._foresight is not None
-        horizon = self.tuning.horizon
-        reference, row = self._rows(k, k + self._delay)
-        inputs, forces = reference.inputs[row : row + horizon], reference.forces[row + 1 : row + 1 + horizon]
-        if outlook is None:
-            states = reference.states[row + 1 : row + 1 + horizon].copy()
-            states[:, 4:] += self._foresight.inputs["shift"]
-            return self._law.fall_back(failure, estimate, Reference(states, inputs, forces + force), self._u), estimate
-        window, ahead = Reference(outlook.states.copy(), inputs, forces + force), outlook.ahead.copy()
-        if isinstance(self._law, LinearMPC):
-            p, q, lower, upper, sizes = outlook.qp
-            rows = constraint_matrix(horizon, self.robot.n_rods)
-            qp = QuadraticProgram(p, q, rows, lower, upper, tuple(sizes.tolist()))
-            models = outlook.models.copy()
-            return self._law.decide(qp, ahead, models, window, self._u, pose_limits, began), ahead
-        return self._law.solve(ahead, outlook.models.copy(), window, self._u, pose_limits), ahead
+        states, n = foresight.rows["states"].copy(), self.robot.n_rods
+        states[:, 4:] += foresight.inputs["shift"]
+        forces = foresight.window[:, 4 + 2 * n :] + force
+        return self._law.fall_back(failure, estimate, Reference(states, foresight.rows["inputs"], forces), self._u)
 
     def _look_on(
         self, outlook: Outlook | None, plan: Plan, estimate: np.ndarray, arriving: np.ndarray, *, foreseen: bool
-    ) -> None:
+    ) -> np.ndarray:
         """Foresee the state at the next measurement; the plan has ``foreseen`` it if its first rates act at once."""
         if outlook is not None and self._delay:
             self._predicts = outlook.now.copy()
-            self._next = outlook.arriving.copy()
-        else:
-            if outlook is not None:
-                # A plan may know better than the models that it was asked for with.
-                better = outlook.models.copy() if plan.models is None or plan.fallback else plan.models
-                self._predicts = LinearModels.of([better] if isinstance(better, LinearModel) else better)
-            if foreseen and plan.states is not None and not plan.fallback:
-                self._next = plan.states[1].copy()
-            else:
-                self._next = self._predicts[0](estimate, arriving)
-        if self.observer is not None:
-            self.observer.x = self._next
+            return outlook.arriving
+        if outlook is not None:
+            # A plan may know better than the models that it was asked for with.
+            better = outlook.models.copy() if plan.models is None or plan.fallback else plan.models
+            self._predicts = LinearModels.of([better] if isinstance(better, LinearModel) else better)
+        if foreseen and plan.states is not None and not plan.fallback:
+            return np.asarray(plan.states[1])
+        return self._predicts[0](estimate, arriving)
 
-    def _within_stops(self, plan: Plan, ahead: np.ndarray) -> Plan:
+    def _within_stops(self, plan: Plan, ahead: np.ndarray, foresight: Foresight) -> Plan:
         """The plan, its first rates within the stops for the sum of the commands too: a wrong angle may be measured."""
-        first = plan.inputs[0]
-        if max(map(abs, (self._reckoned - ahead[4:]).tolist())) <= SAME_ANGLE:
+        if foresight.strayed <= SAME_ANGLE and ahead is foresight.outlook.ahead:
             return plan  # of one opinion, as the law was
-        kept = self._limits.kept(first, self._u, ahead[4:], self._scene.period, self._reckoned)
+        first = plan.inputs[0]
+        kept = self._limits.kept(first, self._u, ahead[4:], self._scene.period, foresight.outlook.reckoned)
         if kept.tolist() == first.tolist():
             return plan
         active = plan.active if "angle" in plan.active else (*plan.active, "angle")
         return replace(plan, inputs=np.vstack([kept, plan.inputs[1:]]), active=active)
-
-    def _rows(self, k: int, row: int) -> tuple[InverseDynamics, int]:
-        """Where to read the reference's ``row`` in period k: beyond the scene's end its last point is held."""
-        last = self._scene.n_periods
-        if k < last:
-            return self._reference, row
-        if self._end is None:
-            payload = float(self._payloads[-1])
-            self._end = held(self._reference, last, self.robot, self._pose, payload, self.tuning.horizon)
-        return self._end, 0
-
-    def _expected(self) -> np.ndarray:
-        """State that is expected at the next step."""
-        return self._next if self.observer is None else self.observer.x
 
     def _take(self, tuning: Tuning) -> None:
         self.__dict__["tuning"], self.name = tuning, tuning.name
@@ -361,84 +346,32 @@ class TrackingController(Remade):
         self._delay = self._told.delay if tuning.model.predict_delay else 0
 
     def _invert_dynamics(self, known: InverseDynamics | None) -> None:
-        tail, inertia = self.tuning.horizon + self._delay, self.tuning.model.inertia
-        self._reference = known or feed_forward(self._scene, self.robot, self._pose, tail, inertia)
+        scene, tail, inertia = self._scene, self.tuning.horizon + self._delay, self.tuning.model.inertia
+        self._reference = known or feed_forward(scene, self.robot, self._pose, tail, inertia)
         # Longer than any place is ahead of the end.
-        times = self._scene.period * np.arange(self._scene.n_periods + 2 * tail)
-        self._payloads = self._scene.carried(times)
+        payloads = scene.carried(scene.period * np.arange(scene.n_periods + 2 * tail))
+
+        def hold() -> InverseDynamics:
+            return held(self._reference, scene.n_periods, self.robot, self._pose, float(payloads[-1]), 1)
+
+        self._track = Track(self._reference, payloads, scene.n_periods, self.tuning.horizon, hold)
 
     def _rest(self) -> LinearModel:
         """Linear model about the start."""
-        model, x = self._make_model(), np.concatenate([self._pose.p, np.zeros(2), self._pose.q])
+        model, x = make_model(self.robot, self.tuning.model), np.concatenate([self._pose.p, np.zeros(2), self._pose.q])
         model.reset(x, self._pose)
         self._resting = linearise(model, x, np.zeros(self.robot.n_rods), self._scene.period)
         return self._resting
 
+    def _make_law(self) -> Law:
+        def inverse(p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
+            return np.asarray(q + self._inverse.shift(p, q, force))
+
+        return make_law(self._scene, self.tuning, self.robot, self._limits, self._pose, inverse)
+
     def _make_foresight(self) -> Foresight:
-        """Graph of the model, the law's QP included, with everything in it that does not change from step to step."""
-        tuning, law = self.tuning, self._law
-        models = tuning.horizon if tuning.model.linearise == "along_plan" else 1
-        places = Places(self._delay, models, tuning.horizon)
-        condense = law.condensing(self.robot.n_rods, models) if isinstance(law, LinearMPC) else None
-        return Foresight(
-            self._make_model(), Plant(self.robot), places, self._scene.period, condense, compiled=tuning.model.compiled
-        )
-
-    @staticmethod
-    def _graph_of(tuning: Tuning) -> tuple[object, ...]:
-        """What of a tuning the graph that looks ahead is made of."""
-        weighed = tuning.velocity_weight > 0, tuning.angle_weight > 0
-        return tuning.model, tuning.horizon, tuning.law, *weighed
-
-    def _write_constants(self) -> None:
-        """Write into the graph that looks ahead what does not change from step to step."""
-        assert self._foresight is not None
-        given = self._foresight.inputs
-        if isinstance(self._law, LinearMPC):
-            given["weights"][:] = stage_weights(self.tuning)
-            given["bounds"][:] = motor_bounds(self._limits)
-            given["terminal"][:] = self._law.terminal
-        if self.observer is not None:
-            given["gain"][:], given["half_step"][:] = self.observer.gain, self.observer.half_step
-        given["carries"][:] = self.observer is not None
-
-    def _make_gate(self) -> Gate:
-        scene, observer = self._told, self.tuning.observer
-        noise = max(scene.tip_noise, observer.tip_noise if observer else 0.0)
-        return Gate(self.robot, self._limits, scene.period, noise, scene.angle_step, scene.wrapped)
-
-    def _make_observer(self, resting: LinearModel) -> DisturbanceObserver | None:
-        if self.tuning.observer is None:
-            return None
-        return DisturbanceObserver(self.tuning.observer, self._told.tip_noise, self._told.angle_step, resting)
-
-    def _make_model(self) -> Plant:
-        model = self.tuning.model
-        return Plant(
-            self.robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
-            inertia=model.inertia,
-        )  # fmt: skip
-
-    def _make_law(self, pose: Equilibrium) -> Law:
-        tuning, limits = self.tuning, self._limits
-        if tuning.law == "linear_mpc":
-            return LinearMPC(tuning, limits)
-        if tuning.law == "nonlinear_mpc":
-            if self._scene.payload is not None:
-                raise ValueError("the nonlinear MPC knows no payload; set [model] payload = false in its tuning")
-            hands, algebraic = rod_unknowns(self.robot, pose)
-            return NonlinearMPC(tuning, limits, symbolic_dynamics(self.robot, hands), algebraic)
-        if tuning.law == "lqr":
-            return LQR(tuning, limits)
-        if tuning.law == "pd":
-            return PD(tuning, limits, lambda p, q, force: q + self._inverse.shift(p, q, force))
-        return FeedForward(tuning, limits)
-
-
-def motor_limits(robot: Robot, period: float) -> Limits:
-    """Limits of the robot's motors as the controller needs them."""
-    lower, upper = robot.angle_limits.T
-    return Limits(robot.rate_limit, robot.acceleration_limit * period, lower.copy(), upper.copy())
+        assert self._law is not None
+        return make_foresight(self.tuning, self._law, self.robot, self._delay, self._scene.period)
 
 
 def make_controller(

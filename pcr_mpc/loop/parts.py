@@ -1,0 +1,105 @@
+"""What a scene's controller is put together from, each part as scene and tuning want it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..control.laws import LQR, PD, FeedForward, Law
+from ..control.mpc import LinearMPC
+from ..control.nonlinear_mpc import NonlinearMPC
+from ..control.observer import DisturbanceObserver
+from ..control.qp import motor_bounds, stage_weights
+from ..control.tuning import Limits, Model, Tuning
+from ..linearisation.linear_model import LinearModel
+from ..plant.motion.plant import Plant
+from ..plant.robot import Robot
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.symbolic import rod_unknowns, symbolic_dynamics
+from .foresight import Foresight
+from .foresight_graph import Places
+from .gate import Gate
+from .scene import Scene
+
+
+def motor_limits(robot: Robot, period: float) -> Limits:
+    """Limits of the robot's motors as the controller needs them."""
+    lower, upper = robot.angle_limits.T
+    return Limits(robot.rate_limit, robot.acceleration_limit * period, lower.copy(), upper.copy())
+
+
+def make_model(robot: Robot, model: Model) -> Plant:
+    """Plant that is linearised."""
+    return Plant(
+        robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
+        inertia=model.inertia,
+    )  # fmt: skip
+
+
+def make_gate(scene: Scene, tuning: Tuning, robot: Robot, limits: Limits) -> Gate:
+    """Gate for the scene's sensors."""
+    noise = max(scene.tip_noise, tuning.observer.tip_noise if tuning.observer else 0.0)
+    return Gate(robot, limits, scene.period, noise, scene.angle_step, scene.wrapped)
+
+
+def make_observer(scene: Scene, tuning: Tuning, resting: LinearModel) -> DisturbanceObserver | None:
+    """Observer, if the tuning wants one; ``resting`` is the linear model about the start."""
+    if tuning.observer is None:
+        return None
+    return DisturbanceObserver(tuning.observer, scene.tip_noise, scene.angle_step, resting)
+
+
+def make_law(
+    scene: Scene,
+    tuning: Tuning,
+    robot: Robot,
+    limits: Limits,
+    pose: Equilibrium,
+    inverse: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+) -> Law:
+    """Control law, for a robot that starts in ``pose``; ``inverse`` is what `PD` asks."""
+    if tuning.law == "linear_mpc":
+        return LinearMPC(tuning, limits)
+    if tuning.law == "nonlinear_mpc":
+        if scene.payload is not None:
+            raise ValueError("the nonlinear MPC knows no payload; set [model] payload = false in its tuning")
+        hands, algebraic = rod_unknowns(robot, pose)
+        return NonlinearMPC(tuning, limits, symbolic_dynamics(robot, hands), algebraic)
+    if tuning.law == "lqr":
+        return LQR(tuning, limits)
+    if tuning.law == "pd":
+        return PD(tuning, limits, inverse)
+    return FeedForward(tuning, limits)
+
+
+def make_foresight(tuning: Tuning, law: Law, robot: Robot, delay: int, period: float) -> Foresight:
+    """Graph that looks ahead ``delay`` periods and a horizon, the law's QP included."""
+    models = tuning.horizon if tuning.model.linearise == "along_plan" else 1
+    places = Places(delay, models, tuning.horizon)
+    condense = law.condensing(robot.n_rods, models) if isinstance(law, LinearMPC) else None
+    model = make_model(robot, tuning.model)
+    return Foresight(model, Plant(robot), places, period, condense, compiled=tuning.model.compiled)
+
+
+def graph_of(tuning: Tuning) -> tuple[object, ...]:
+    """What of a tuning that graph is made of."""
+    weighed = tuning.velocity_weight > 0, tuning.angle_weight > 0
+    return tuning.model, tuning.horizon, tuning.law, *weighed
+
+
+def write_constants(
+    foresight: Foresight, tuning: Tuning, law: Law, limits: Limits, observer: DisturbanceObserver | None
+) -> None:
+    """Write into the graph what does not change from step to step, and let the observer live in it."""
+    given = foresight.inputs
+    if isinstance(law, LinearMPC):
+        given["weights"][:] = stage_weights(tuning)
+        given["bounds"][:] = motor_bounds(limits)
+        given["terminal"][:] = law.terminal
+    if observer is not None:
+        given["gain"][:], given["half_step"][:] = observer.gain, observer.half_step
+        observer.live_in(given["estimate"])
+    else:
+        given["gain"][:], given["half_step"][:], given["estimate"][-2:] = 0.0, 0.0, 0.0
+    given["carries"][:] = observer is not None
