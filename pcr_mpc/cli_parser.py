@@ -21,6 +21,7 @@ examples:
   pcr-mpc track lemniscate --plant mujoco               against another engine's robot
   pcr-mpc export planar_pair --p 0 0.25 --mode LR --out pair.xml   that robot as MJCF
   pcr-mpc choose vertical                               what physics the scene needs, and why
+  pcr-mpc identify lemniscate run.csv --out mine.toml   a robot's numbers from recorded motion
   pcr-mpc timing lemniscate                             step times against the real-time budgets
   pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
   pcr-mpc copy lemniscate mine                          a copy of that scene to change
@@ -126,6 +127,32 @@ def parser() -> argparse.ArgumentParser:
     )
     choice.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
     choice.add_argument("--write", action="store_true", help="put the chosen rung into the scene's [plant] table")
+
+    identity = command(
+        "identify",
+        "cli_identify",
+        "identify_robot",
+        "Find a robot's numbers from logs of its motion: stiffness, mass, drag, bases, delay and load, with what the "
+        "logs cannot tell.",
+    )
+    identity.add_argument("scene", help="scene: a file, or a name of pcr-mpc models; its robot is what is believed")
+    identity.add_argument("logs", nargs="+", metavar="LOG", help="run.csv or run.npz of `track`, or a CSV file with "
+                          "columns t_s, p_x_m, p_y_m, q0_rad, ..., u0_rad_s, ... at a uniform rate; cells may be "
+                          "empty and rows missing")  # fmt: skip
+    identity.add_argument("--free", action="append", metavar="NAMES", help="what is unknown, separated by commas: "
+                          "bending_stiffness, length, base, line_density (of all rods, or as rods[0].length), tip_mass, "
+                          "drag, motor_zero, tip_offset, delay, force; default stands for bending_stiffness, tip_mass, "
+                          "drag, base, delay and force, as in --free default,motor_zero")  # fmt: skip
+    identity.add_argument("--fix", action="append", default=[], metavar="NAME=VALUE", help="a number that is known, in "
+                          "SI units, as tip_mass=0.251 of a tip that was weighed; delay in control periods")  # fmt: skip
+    identity.add_argument("--validate", action="append", default=[], metavar="LOG", help="log that is only predicted")
+    identity.add_argument("--loss", choices=("auto", "squares", "huber"), default="auto",
+                          help="huber bears outliers; auto takes it where there are some (default)")  # fmt: skip
+    identity.add_argument("--robust", action="store_true", help="the same as --loss huber")
+    identity.add_argument("--out", type=Path, metavar="FILE", help="robot file to write, with an [uncertainty] table "
+                          "that a later call starts from")  # fmt: skip
+    identity.add_argument("--results", type=Path, metavar="FOLDER", help="for table and picture (default "
+                          "results/identify/SCENE)")  # fmt: skip
 
     timing = command(
         "timing",

@@ -83,6 +83,14 @@ class NoRungError(PCRError):
     """No rung of the ladder of physics meets a scene's ``need``: ``best_error`` [m], and why each was ``rejected``."""
 
 
+class LogError(PCRError, ValueError):
+    """A recorded motion cannot be read, or is none of the scene's robot: names the ``file``."""
+
+
+class IdentificationError(PCRError, ValueError):
+    """A robot's numbers cannot be found as asked, or the best that there are do not explain what was recorded."""
+
+
 class OutputError(PCRError):
     """A file cannot be written, or is somebody's work and is left alone: ``path``."""
 

@@ -174,6 +174,26 @@ class Table:
         """Look at a value without taking it; None if it is not there."""
         return self._data.get(key)
 
+    def texts(self, key: str) -> tuple[str, ...]:
+        """Take a list of strings that is not empty."""
+        value = self._take(key, _REQUIRED)
+        if not isinstance(value, list) or not value or not all(isinstance(one, str) for one in value):
+            raise self.fail(key, f"expected a list of strings, found {value!r}")
+        return tuple(value)
+
+    def matrix(self, key: str, size: int, default: Any = _REQUIRED) -> Any:
+        """Take a list of ``size`` rows of ``size`` finite numbers."""
+        value = self._take(key, default)
+        if value is default:
+            return default
+        if (
+            not isinstance(value, list)
+            or len(value) != size
+            or any(not isinstance(row, list) or len(row) != size or any(map(number_problem, row)) for row in value)
+        ):
+            raise self.fail(key, f"expected {size} rows of {size} finite numbers, found {value!r}")
+        return tuple(tuple(map(float, row)) for row in value)
+
     def has(self, key: str) -> bool:
         """Whether the key is there and not taken yet."""
         self._known.append(key)

@@ -68,7 +68,8 @@ def assert_close(found, wanted, tolerance):
 def check(robot, pose, tolerance=1e-5, **settings):
     plant, x0 = Plant(robot, **settings), start_at(pose)
     inputs, f_ext = motion(n=robot.n_rods)
-    found = sensitivities(plant, x0, inputs, f_ext, guess=pose)
+    ways = np.random.default_rng(4).normal(0.0, 1.0, (STEPS, robot.n_rods + 2, 2))
+    found = sensitivities(plant, x0, inputs, f_ext, guess=pose, ways=ways)
     assert found.names == plant.step_model.kind.names
     assert found.x == pytest.approx(rollout(plant, x0, inputs, f_ext, guess=pose).x, abs=1e-10)
     by_differences, sizes = differences(plant, x0, inputs, f_ext, pose)
@@ -78,6 +79,11 @@ def check(robot, pose, tolerance=1e-5, **settings):
     x = rollout(plant, starts, inputs, f_ext, guess=pose).x
     columns = [fourth_order(x[4 * i : 4 * i + 4], h) for i in range(size)]
     assert_close(found.dx_dx0, np.stack(columns, axis=2), 1e-7)
+    changes = [k * 1e-3 * ways[:, :, j] for j in range(2) for k in (-2, -1, 1, 2)]
+    n = robot.n_rods
+    x = [rollout(plant, x0, inputs + c[:, :n], f_ext + c[:, n:], guess=pose).x for c in changes]
+    along = np.stack([fourth_order(x[4 * j : 4 * j + 4], 1e-3) for j in range(2)], axis=2)
+    assert_close(found.dx_dways, along, 1e-6)
     return found
 
 
@@ -249,3 +255,9 @@ def test_a_snap_has_no_derivative(pair, centre):
         error = caught.value
         assert 20 < error.step < 240
         assert error.state[4] - centre.q[0] == pytest.approx(0.03 * error.step)
+
+
+def test_ways_of_another_shape_are_refused(pair, centre):
+    plant = Plant(pair)
+    with pytest.raises(ValueError, match=r"ways has shape \(3, 4\), expected \(3, 4, 1\)"):
+        sensitivities(plant, start_at(centre), np.zeros((3, 2)), guess=centre, ways=np.zeros((3, 4)))

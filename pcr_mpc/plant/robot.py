@@ -16,6 +16,7 @@ from ..files import name_problem
 from ..frozen import Frozen, read_only
 from ..toml_table import read_toml
 from .rod import MANY_TURNS, NOT_NEGATIVE, POSITIVE, Rod, doubtful_limits, read_rod
+from .uncertainty import read_uncertainty
 
 # Strain of a rod that can stretch beyond which no rod is elastic.
 _LARGEST_STRAIN = 0.01
@@ -205,6 +206,7 @@ def load_robot(path: str | Path) -> Robot:
                 warnings.warn(f"{path}: rods.angle_limits: {doubtful_limits(rods[-1])}", stacklevel=2)
         with file.table("world", {}) as world:
             gravity = world.vector("gravity", 2, (0.0, 0.0))
+        read_uncertainty(file)  # how well the numbers are known is nothing of the robot's, but must be right
         with file.table("tip") as tip, file.table("motors") as motors:
             numbers = {
                 "tip_mass": tip.number("mass", **_ROBOT_NUMBERS["tip_mass"]),

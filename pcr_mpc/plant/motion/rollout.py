@@ -19,7 +19,7 @@ from .plant import Plant
 from .step_graph import CORRECTIONS, StepModel, limits, step_function
 
 # Steps in one call: more of them make nothing faster.
-_STEPS = 1000
+STEPS_AT_ONCE = 1000
 # Robots times steps in one call: a few hundred bytes each, which stay.
 _MOST_STEPS = 20_000
 
@@ -98,7 +98,7 @@ def rollout(
     x, residual = np.empty((count, steps + 1, plant.n_states)), np.empty((count, steps))
     memories = _memories(plants, starts, guess)
     numbers = np.stack([one.numbers for one in plants])  # after the resets, which take a payload away
-    at_once = max(1, _MOST_STEPS // min(steps, _STEPS))
+    at_once = max(1, _MOST_STEPS // min(steps, STEPS_AT_ONCE))
     done = np.zeros(count, dtype=bool)
     for corrections in CORRECTIONS:
         left = np.flatnonzero(~done)
@@ -180,8 +180,8 @@ def _moved(
     robots, steps = given.shape[:2]
     x, verdicts = np.empty((robots, steps + 1, starts.shape[1])), np.empty((robots, steps, 5))
     x[:, 0] = starts
-    for first in range(0, steps, _STEPS):
-        block = slice(first, min(steps, first + _STEPS))
+    for first in range(0, steps, STEPS_AT_ONCE):
+        block = slice(first, min(steps, first + STEPS_AT_ONCE))
         length = block.stop - first
         graph = _many_steps(model, length, robots, *settings)
         # CasADi puts robots and steps side by side, column by column: rows of these views.

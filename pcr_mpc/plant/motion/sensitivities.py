@@ -8,23 +8,24 @@ differentiated, on whose start the solution does not depend. Steps are joined by
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ...buffered import BufferedFunction, graph_cache
-from ...errors import UnstableError
+from ...buffered import BufferedFunction, graph_cache, per_thread
+from ...errors import checked_array
 from ...frozen import Frozen
 from ..rods.method import RodMethod
 from ..rods.numbers import Kind
 from ..statics.equilibrium import Equilibrium
-from .integrators import INTEGRATORS
-from .mass_matrix import MassMatrix, robot_mass
+from .mass_matrix import robot_mass
 from .plant import Plant
-from .rollout import checked_motion, said_of
+from .rollout import STEPS_AT_ONCE, checked_motion
 from .step_graph import SOLVES, Motion, StepModel
+from .trails import moved_on_a_trail
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,8 @@ class Sensitivities(Frozen):
         In the state at the start.
     dx_dnumbers : ndarray, shape (T + 1, 4 + n, K)
         In the robot's numbers, in SI units.
+    dx_dways : ndarray, shape (T + 1, 4 + n, D)
+        Along the ways in which what acts on the robot may change.
     names : tuple of str
         Of the K numbers (see `Kind`, which has their units).
     """
@@ -49,19 +52,27 @@ class Sensitivities(Frozen):
     x: np.ndarray
     dx_dx0: np.ndarray
     dx_dnumbers: np.ndarray
+    dx_dways: np.ndarray
     names: tuple[str, ...]
 
 
 def sensitivities(
-    plant: Plant, x0: Any, inputs: Any, f_ext: Any = (0.0, 0.0), *, guess: Equilibrium | None = None
+    plant: Plant,
+    x0: Any,
+    inputs: Any,
+    f_ext: Any = (0.0, 0.0),
+    *,
+    guess: Equilibrium | None = None,
+    ways: Any = None,
 ) -> Sensitivities:
     """Move a robot through a sequence of inputs, and differentiate its states in the start and in its numbers.
 
     The derivatives are those of the discrete motion, to rounding and to the tolerance of the statics. The start is held
-    when numbers change, and so are inputs and f_ext. Where a motor just reaches its stop or its limit of rate, there is
-    no derivative, and what is given lies between those of both sides. A number on which the motion does not depend has
-    the derivative zero: the stops of motors that do not reach them; gravity as far as it pulls on rods whose weight the
-    plant leaves out, as by default where gravity is zero (with ``weight="condensed"`` it does not).
+    when numbers change, and so are inputs and f_ext. These may change, too: along each of D ways, such as a force that
+    is always there, or commands that come a little later. Where a motor just reaches its stop or its limit of rate,
+    there is no derivative, and what is given lies between those of both sides. A number on which the motion does not
+    depend has the derivative zero: the stops of motors that do not reach them; gravity as far as it pulls on rods whose
+    weight the plant leaves out, as by default where gravity is zero (with ``weight="condensed"`` it does not).
 
     Parameters
     ----------
@@ -75,6 +86,8 @@ def sensitivities(
         External force on the tip besides its weight [N].
     guess : Equilibrium, optional
         On whose branch the rods start; None: on that of least energy.
+    ways : array_like, shape (T, n + 2, D), optional
+        Derivatives of [inputs, f_ext] of every step in D unknowns. None: there are none.
 
     Raises
     ------
@@ -91,66 +104,50 @@ def sensitivities(
     if many:
         raise ValueError("sensitivities are of one robot: x0 and f_ext have two axes at most, inputs have two")
     start, inputs, f_ext = starts[0], all_inputs[0], all_forces[0]
-    x, trails = _moved(plant, start, inputs, f_ext, guess)
+    x, trails = moved_on_a_trail(plant, start, inputs, f_ext, guess)
 
-    size, numbers = plant.n_states, plant.numbers
+    size, numbers, steps, n_given = plant.n_states, plant.numbers, len(inputs), plant.robot.n_rods + 2
+    if ways is None:
+        ways = np.empty((steps, n_given, 0))
+    ways = checked_array(
+        "ways", ways, (steps, n_given, *np.shape(ways)[2:3]) if np.ndim(ways) == 3 else (steps, n_given, 1)
+    )
     both = size + len(numbers)
-    derivatives = np.empty((len(x), size, both))
-    derivatives[0] = np.eye(size, both)
+    derivatives = np.zeros((len(x), size, both + ways.shape[2]))
+    derivatives[0] = np.eye(size, derivatives.shape[2])
     kept = _begun(model, start, numbers, trails[0][0])
-    graph = BufferedFunction(_step_slopes(model))
-    variables, given, held, trail = graph.inputs
-    variables[size : size + len(kept[0])], variables[-len(numbers) :], held[:] = kept[0], numbers, numbers
-    for k, places in enumerate(trails):
-        variables[:size], given[:], trail[:] = x[k], np.concatenate([inputs[k], f_ext[k]]), places.T
-        graph()
-        slopes = graph.outputs[0]
-        derivatives[k + 1] = slopes[:, :size] @ derivatives[k] + slopes[:, size : -len(numbers)] @ kept[1]
-        derivatives[k + 1, :, size:] += slopes[:, -len(numbers) :]
+    slopes = _all_slopes(model, x, np.hstack([inputs, f_ext]), kept[0], numbers, trails)
+    of_numbers = slice(size + len(kept[0]), -n_given)
+    for k, slope in enumerate(slopes):
+        derivatives[k + 1] = slope[:, :size] @ derivatives[k]
+        derivatives[k + 1, :, :both] += slope[:, size : size + len(kept[0])] @ kept[1]
+        derivatives[k + 1, :, size:both] += slope[:, of_numbers]
+        derivatives[k + 1, :, both:] += slope[:, -n_given:] @ ways[k]
     t = plant.dt * np.arange(len(x))
-    return Sensitivities(t, x, derivatives[:, :, :size].copy(), derivatives[:, :, size:].copy(), model.kind.names)
+    parts = (part.copy() for part in np.split(derivatives, [size, both], axis=2))
+    return Sensitivities(t, x, *parts, names=model.kind.names)
 
 
-class _Watched:
-    """A plant as the integrators see it, that notes where it has been: [p, q, unknowns] of every call."""
+def _all_slopes(
+    model: StepModel, x: np.ndarray, given: np.ndarray, kept: np.ndarray, numbers: np.ndarray, trails: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Derivatives of every step's end in [x, kept, numbers, u, f_ext], shape (4 + n, ...)."""
+    held = np.concatenate([kept, numbers])
+    for first in range(0, len(given), STEPS_AT_ONCE):
+        block = slice(first, min(len(given), first + STEPS_AT_ONCE))
+        steps = block.stop - first
+        graph = _many_slopes(model, steps)
+        variables, of_held, places = (place.T.reshape(steps, -1) for place in graph.inputs)
+        variables[:] = np.hstack([x[block], np.tile(held, (steps, 1)), given[block]])
+        of_held[:], places[:] = numbers, trails[block].reshape(steps, -1)
+        graph()
+        yield from graph.outputs[0].T.reshape(steps, -1, x.shape[1]).transpose(0, 2, 1)
 
-    def __init__(self, plant: Plant) -> None:
-        self._plant = plant
-        self.robot, self.dt = plant.robot, plant.dt
-        self.places: list[np.ndarray] = []
 
-    def force_and_mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, MassMatrix]:
-        unknowns = self._plant.rods(p, q).unknowns
-        self.places.append(np.concatenate([p, q, unknowns.ravel(order="F")]))
-        return self._plant.force_and_mass(p, q)
-
-    def mass(self, p: np.ndarray, q: np.ndarray) -> MassMatrix:
-        return self.force_and_mass(p, q)[1]
-
-
-def _moved(
-    plant: Plant, start: np.ndarray, inputs: np.ndarray, f_ext: np.ndarray, guess: Equilibrium | None
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """States, and of every step the places of its forces, that at its start first."""
-    x, trails = np.empty((len(inputs) + 1, len(start))), []
-    x[0] = start
-    with said_of(plant, 0, 0, start):
-        plant.reset(start, guess)
-    advance = INTEGRATORS[plant.integrator](plant.robot.n_rods)
-    for k, (u, force) in enumerate(zip(inputs, f_ext, strict=True)):
-        watched = _Watched(plant)
-        with said_of(plant, 0, k, x[k]):
-            rates = plant.robot.motor_rates(u, x[k, 4:], plant.dt)
-            x[k + 1] = advance(watched, x[k], rates, force + plant.tip_weight)
-            if plant.snaps:
-                snap = plant.snaps[0]
-                raise UnstableError(
-                    f"rod {snap.rod} snapped at p = {snap.p} m: the motion has no derivative there; end it before",
-                    rod=snap.rod,
-                )
-        # RK4 asks for the mass at the start before it asks for the force there.
-        trails.append(np.stack(watched.places[-1 - SOLVES[plant.integrator] :]))
-    return x, trails
+@per_thread(maxsize=8)
+def _many_slopes(model: StepModel, steps: int) -> BufferedFunction:
+    graph = _step_slopes(model)
+    return BufferedFunction(graph.map(steps, "serial") if steps > 1 else graph)
 
 
 def _begun(
@@ -224,18 +221,19 @@ def _widths(model: StepModel) -> tuple[int, int, int]:
 
 @graph_cache(maxsize=16)
 def _step_slopes(model: StepModel) -> Any:
-    """Build ([x, kept, numbers], [u, f_ext], numbers, trail) -> derivatives of the next x in the first argument."""
+    """Build ([x, kept, numbers, u, f_ext], numbers, trail) -> derivatives of the next x in the first argument."""
     n = model.kind.n_rods
     kept, size, width = _widths(model)
-    variables, given = ca.MX.sym("variables", 4 + n + kept + size), ca.MX.sym("given", n + 2)
-    held, trail = ca.MX.sym("held", size), ca.MX.sym("trail", width, 1 + SOLVES[model.integrator])
-    x, mass, vector = ca.vertsplit(variables, [0, 4 + n, 4 + n + kept, 4 + n + kept + size])
+    ends = np.cumsum([0, 4 + n, kept, size, n + 2]).tolist()
+    variables, held = ca.MX.sym("variables", ends[-1]), ca.MX.sym("held", size)
+    trail = ca.MX.sym("trail", width, 1 + SOLVES[model.integrator])
+    x, mass, vector, given = ca.vertsplit(variables, ends)
     motion = _SolvedMotion(trail, held, model, vector, given[:n], x[4:], given[n:])
     if kept:
         motion.mass = ca.reshape(mass, 2 + n, 2 + n), motion.mass[1]
     motion.move(x[:2], x[4:])
     slopes = ca.jacobian(motion.advance(x), variables)
-    return ca.Function("step_slopes", [variables, given, held, trail], [ca.densify(slopes)])
+    return ca.Function("step_slopes", [variables, held, trail], [ca.densify(slopes)])
 
 
 @graph_cache(maxsize=16)

@@ -134,6 +134,7 @@ class _WarmMotion(Motion):
         self.verdict: Any = 0
         self.record: Any = None
         self.result: Any = None
+        self.places: list[Any] = []
 
     def follow(self, p: Any, q: Any) -> tuple[Any, Any]:
         model = self.model
@@ -141,8 +142,9 @@ class _WarmMotion(Motion):
         self.record, verdict, self.result = warm(ca.vertcat(p, q), self.start, self.of_rods)
         self.verdict += verdict
         self.start = self.record[: model.widths[0]]
-        unknowns = ca.reshape(self.record[: model.method.newton.size1_in(0) * self.n], -1, self.n)
-        return unknowns, self.result[:2]
+        unknowns = self.record[: model.method.newton.size1_in(0) * self.n]
+        self.places.append(ca.vertcat(p, q, unknowns))
+        return ca.reshape(unknowns, -1, self.n), self.result[:2]
 
     def memory(self) -> Any:
         """What the next step starts from."""
@@ -197,19 +199,31 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
         at the end of the step (see `warm_step`). A memory is of the pose of its x. u is what the motors are told, f_ext
         comes on top of the tip's weight. The verdict is that of `warm_step`, added up over the solves of the step.
     """
-    n = model.kind.n_rods
+    motion, arguments, results = _step(model, corrections)
+    if details:
+        results += [motion.record, motion.result]
+    return ca.Function("step", arguments, [ca.densify(r) for r in results])
+
+
+@graph_cache(maxsize=16)
+def trail_graph(model: StepModel, corrections: int) -> Any:
+    """`step_graph` with, as its last result, the places [p, q, unknowns] of all its solves in one vector."""
+    motion, arguments, results = _step(model, corrections)
+    return ca.Function("step", arguments, [ca.densify(r) for r in [*results, ca.vertcat(*motion.places)]])
+
+
+def _step(model: StepModel, corrections: int) -> tuple[_WarmMotion, list[Any], list[Any]]:
+    """Rods on their way through a step, its arguments, and the results that every graph of it has."""
     graphs = [warm_step(model.kind, model.method, corrections)]
     if model.inertia == "condensed":
         graphs.append(robot_mass(model.kind, model.method))
     symbol: Any = (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym
+    n = model.kind.n_rods
     memory, x, given = symbol("memory", sum(model.widths)), symbol("x", 4 + n), symbol("given", n + 2)
     vector = symbol("numbers", model.kind.size)
     motion = _WarmMotion(memory, corrections, model, vector, given[:n], x[4:], given[n:])
     end = motion.advance(x)
-    results = [motion.memory(), end, motion.verdict]
-    if details:
-        results += [motion.record, motion.result]
-    return ca.Function("step", [memory, x, given, vector], [ca.densify(r) for r in results])
+    return motion, [memory, x, given, vector], [motion.memory(), end, motion.verdict]
 
 
 @graph_cache(maxsize=32)

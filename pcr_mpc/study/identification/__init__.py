@@ -1,0 +1,1 @@
+"""From recorded motion to the robot's numbers."""

@@ -1,0 +1,249 @@
+"""Least squares: what was measured against what numbers predict, and against what was believed of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .parameters import Parameters
+from .prediction import Piece, Predictor
+
+# Beyond so many standard deviations Huber's loss grows linearly.
+HUBER = 1.5
+# What is believed of a start, in its scales: next to nothing.
+_START = 100.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of the readings of a log: of the tip [m] and of the angles [rad]."""
+
+    tip: float
+    angle: float
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """A point of the search.
+
+    Attributes
+    ----------
+    z : ndarray, shape (F,)
+        Free parameters.
+    missing : tuple of ndarray
+        Of each log, by how much each missing command is off a straight line [rad/s].
+    starts : ndarray, shape (S, 4 + n)
+        States in which the pieces begin.
+    """
+
+    z: np.ndarray
+    missing: tuple[np.ndarray, ...]
+    starts: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Residuals of the readings, in standard deviations: NaN where there was none.
+
+    Attributes
+    ----------
+    tip, angle : list of ndarray
+        Of each log, shapes (M, 2) and (M, n); predicted less measured.
+    x : list of ndarray
+        Predicted states of each log at its rows, shape (M, 4 + n); NaN where it was not predicted.
+    """
+
+    tip: list[np.ndarray]
+    angle: list[np.ndarray]
+    x: list[np.ndarray]
+
+
+class Problem:
+    """Residuals and their Jacobian.
+
+    Unknowns are, in this order, the starts of all pieces in their scales, the missing commands in standard deviations,
+    and the free parameters' z. Residuals are of the readings, of the joints between pieces, and of what was believed.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    parameters : Parameters
+    pieces : sequence of Piece
+    noise : sequence of Noise
+        Of each log.
+    joint : float
+        Standard deviation of a gap between joined pieces, in those of the readings.
+    robust : bool
+        Huber's loss for the readings instead of squares.
+    corrections : list of ndarray, optional
+        Of each piece, what is added to its states at its rows.
+    around : Guess
+        First guess, in which starts are believed, next to nothing.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        parameters: Parameters,
+        pieces: Sequence[Piece],
+        noise: Sequence[Noise],
+        around: Guess,
+        *,
+        joint: float = 1e-3,
+        robust: bool = False,
+        corrections: Sequence[np.ndarray] | None = None,
+    ) -> None:
+        self.predictor, self.parameters, self.pieces = predictor, parameters, tuple(pieces)
+        self.noise, self.joint, self.robust, self.around = tuple(noise), joint, robust, around
+        self.corrections = corrections
+        n, length = predictor.n, float(parameters.robot.lengths.mean())
+        self.scales = np.array([1e-3 * length] * 2 + [1e-3 * length * predictor.omega] * 2 + [1e-3] * n)
+        # A missing command is believed to be like its neighbours within the changes that there are.
+        self._spread = [
+            np.maximum(np.nanstd(log.u, axis=0), 1e-3) if log.missing.size else np.ones(n) for log in predictor.logs
+        ]
+        self._of_missing = [
+            spread[np.argwhere(np.isnan(log.u))[:, 1]] for log, spread in zip(predictor.logs, self._spread, strict=True)
+        ]
+        counts = [len(of) for of in self._of_missing]
+        self._at_missing = np.cumsum([0, *counts]) + len(self.pieces) * (4 + n)
+        self.size = int(self._at_missing[-1]) + len(parameters.free)
+        self.n_readings, self.growth = 0, 0.0
+        self._of_angle = [parameters.index(f"motor_zero[{i}]") for i in range(n)]
+        self._of_tip = [parameters.index(f"tip_offset_{axis}") for axis in "xy"]
+
+    def packed(self, guess: Guess) -> np.ndarray:
+        """One vector of all unknowns, shape (size,)."""
+        starts = (guess.starts - self.around.starts) / self.scales
+        missing = [each / scale for each, scale in zip(guess.missing, self._of_missing, strict=True)]
+        return np.concatenate([starts.ravel(), *missing, guess.z])
+
+    def unpacked(self, vector: np.ndarray) -> Guess:
+        """Inverse of `packed`."""
+        states = 4 + self.predictor.n
+        starts = vector[: len(self.pieces) * states].reshape(-1, states) * self.scales + self.around.starts
+        at = self._at_missing
+        missing = [vector[a:b] * scale for a, b, scale in zip(at[:-1], at[1:], self._of_missing, strict=True)]
+        return Guess(vector[at[-1] :].copy(), tuple(missing), starts)
+
+    def residuals(self, vector: np.ndarray) -> np.ndarray:
+        """All residuals; errors as `Predictor.states`."""
+        guess = self.unpacked(vector)
+        states = self.predictor.states(self.parameters, guess.z, guess.missing, self.pieces, guess.starts)
+        return self._assembled(vector, self._corrected(states), None)[0]
+
+    def linearised(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals and their Jacobian, shape (rows, size); errors as `Predictor.states`."""
+        guess = self.unpacked(vector)
+        states, slopes, n_states = [], [], 4 + self.predictor.n
+        for i, (piece, start) in enumerate(zip(self.pieces, guess.starts, strict=True)):
+            found = self.predictor.derivatives(self.parameters, guess.z, guess.missing[piece.log], piece, start)
+            relative = np.abs(found.by_start * self.scales / self.scales[:, None])
+            self.growth = max(self.growth if i else 0.0, float(relative.max()))
+            slope = np.zeros((*found.x.shape, self.size))
+            slope[:, :, i * n_states : (i + 1) * n_states] = found.by_start * self.scales
+            first, last = self._at_missing[piece.log : piece.log + 2]
+            slope[:, :, first:last] = found.by_missing * self._of_missing[piece.log]
+            slope[:, :, self._at_missing[-1] :] = found.by_free
+            states.append(found.x)
+            slopes.append(slope)
+        residuals, jacobian = self._assembled(vector, self._corrected(states), slopes)
+        assert jacobian is not None
+        return residuals, jacobian
+
+    def loss(self, residuals: np.ndarray) -> float:
+        """Half the sum of squares, or of Huber's loss of the readings."""
+        half = 0.5 * residuals**2
+        if self.robust:
+            size = np.abs(residuals[: self.n_readings])
+            half[: self.n_readings] = np.where(size <= HUBER, half[: self.n_readings], HUBER * (size - HUBER / 2.0))
+        return float(half.sum())
+
+    def weights(self, residuals: np.ndarray) -> np.ndarray:
+        """Square roots of the weights with which squares stand for the loss about these residuals."""
+        weights = np.ones(len(residuals))
+        if self.robust:
+            size = np.maximum(np.abs(residuals[: self.n_readings]), HUBER)
+            weights[: self.n_readings] = np.sqrt(HUBER / size)
+        return weights
+
+    def readings(self, vector: np.ndarray) -> Readings:
+        """Residuals log by log; errors as `Predictor.states`."""
+        guess = self.unpacked(vector)
+        states = self._corrected(
+            self.predictor.states(self.parameters, guess.z, guess.missing, self.pieces, guess.starts)
+        )
+        return self.compared(guess.z, states)
+
+    def compared(self, z: np.ndarray, states: Sequence[np.ndarray]) -> Readings:
+        """Residuals log by log of the states of all pieces."""
+        values = self.parameters.values(z)
+        tips, angles, all_states = [], [], []
+        for number, log in enumerate(self.predictor.logs):
+            x = np.full((len(log.t), 4 + self.predictor.n), np.nan)
+            for piece, state in zip(self.pieces, states, strict=True):
+                if piece.log == number:
+                    count = len(state) - piece.joined
+                    x[piece.first : piece.first + count] = state[:count]
+            offset = np.array([values[f"tip_offset_{axis}"] for axis in "xy"])
+            zeros = np.array([values[f"motor_zero[{i}]"] for i in range(self.predictor.n)])
+            tips.append((x[:, :2] + offset - log.p) / self.noise[number].tip)
+            angles.append((x[:, 4:] + zeros - log.q) / self.noise[number].angle)
+            all_states.append(x)
+        return Readings(tips, angles, all_states)
+
+    def _corrected(self, states: Sequence[np.ndarray]) -> list[np.ndarray]:
+        if self.corrections is None:
+            return list(states)
+        return [x + change for x, change in zip(states, self.corrections, strict=True)]
+
+    def _assembled(
+        self, vector: np.ndarray, states: Sequence[np.ndarray], slopes: Sequence[np.ndarray] | None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        guess, n, first_free = self.unpacked(vector), self.predictor.n, int(self._at_missing[-1])
+        values = self.parameters.values(guess.z)
+        by_z = self.parameters.slopes(guess.z)
+        rows: list[np.ndarray] = []
+        lines: list[np.ndarray] = []
+        offset = np.array(
+            [*(values[f"tip_offset_{axis}"] for axis in "xy"), *(values[f"motor_zero[{i}]"] for i in range(n))]
+        )
+        columns = [0, 1, *range(4, 4 + n)]
+        for i, (piece, x) in enumerate(zip(self.pieces, states, strict=True)):
+            log, noise = self.predictor.logs[piece.log], self.noise[piece.log]
+            last = piece.last if piece.joined else piece.last + 1
+            at = slice(piece.first, last)
+            seen = np.hstack([log.p[at], log.q[at]])
+            scale = np.array([noise.tip] * 2 + [noise.angle] * n)
+            rest = (x[: len(seen), columns] + offset - seen) / scale
+            known = ~np.isnan(rest)
+            rows.append(rest[known])
+            if slopes is not None:
+                slope = slopes[i][: len(seen), columns] / scale[:, None]
+                for j, index in enumerate([*self._of_tip, *self._of_angle]):
+                    if index is not None:
+                        slope[:, j, first_free + index] += by_z[index] / scale[j]
+                lines.append(slope[known])
+        self.n_readings = sum(map(len, rows))
+        n_states = 4 + n
+        for i, (piece, x) in enumerate(zip(self.pieces, states, strict=True)):
+            if not piece.joined:
+                continue
+            noise = self.noise[piece.log]
+            gap = self.joint * np.array([noise.tip] * 2 + [noise.tip * self.predictor.omega] * 2 + [noise.angle] * n)
+            rows.append((x[-1] - guess.starts[i + 1]) / gap)
+            if slopes is not None:
+                slope = slopes[i][-1].copy()
+                slope[:, (i + 1) * n_states : (i + 2) * n_states] -= np.diag(self.scales)
+                lines.append(slope / gap[:, None])
+        rows += [vector[:first_free] / np.where(np.arange(first_free) < len(self.pieces) * n_states, _START, 1.0)]
+        rows.append(self.parameters.root @ guess.z)
+        if slopes is None:
+            return np.concatenate(rows), None
+        believed = np.zeros((self.size, self.size))
+        weak = np.where(np.arange(first_free) < len(self.pieces) * n_states, _START, 1.0)
+        believed[:first_free, :first_free] = np.diag(1.0 / weak)
+        believed[first_free:, first_free:] = self.parameters.root
+        return np.concatenate(rows), np.concatenate([*lines, believed])
