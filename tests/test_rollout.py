@@ -146,7 +146,7 @@ def test_every_robot_has_its_own_force_at_every_step(pair, centre):
 
 
 def test_more_steps_than_one_call_takes(pair, centre, monkeypatch):
-    monkeypatch.setattr("pcr_mpc.plant.motion.rollout._STEPS", 25)
+    monkeypatch.setattr("pcr_mpc.plant.motion.rollout.STEPS_AT_ONCE", 25)
     monkeypatch.setattr("pcr_mpc.plant.motion.rollout._MOST_STEPS", 50)
     x, inputs = start_at(centre), np.stack([brisk(STEPS), -brisk(STEPS), 0.5 * brisk(STEPS)])
     plant = Plant(pair, inertia="condensed")

@@ -19,7 +19,7 @@ from .problem import Guess, Noise
 # Readings about a start by which its position and velocity are guessed.
 _ABOUT = 7
 # Least noise, relative to the mean length of the rods, or in radians: rounding.
-_LEAST = 1e-8
+_LEAST = 1e-7
 # Length of a piece of multiple shooting [s], and of a piece of a long run [s].
 SHORT, LONG = 0.4, 5.0
 

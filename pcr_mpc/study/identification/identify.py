@@ -113,7 +113,7 @@ def identify(
         scene=scene,
         robot=parameters.robot_at(found.z),
         estimates=estimates,
-        correlation=_correlation(known.covariance),
+        correlation=_correlation(parameters, found.z, known),
         delay=values["delay"],
         forces=forces,
         fits=fits,
@@ -198,28 +198,32 @@ def _require_explained(fits: Sequence[Fit], found: Found, scene: Scene) -> None:
 
 
 def _estimates(parameters: Parameters, found: Found, known: Information, scene: Scene) -> tuple[Estimate, ...]:
-    believed = np.linalg.inv(parameters.root.T @ parameters.root)
+    believed = np.sqrt(np.diag(np.linalg.inv(parameters.root.T @ parameters.root)))
+    values, gradient = parameters.values(found.z), parameters.gradient(found.z)
+    sds = np.sqrt(np.diag(gradient @ known.covariance @ gradient.T))
     estimates = []
-    for i, one in enumerate(parameters.free):
-        z, sd = float(found.z[i]), float(np.sqrt(known.covariance[i, i]))
-        before = float(np.sqrt(believed[i, i]))
+    for one, sd, before, slope in zip(parameters.free, sds.tolist(), believed.tolist(), np.diag(gradient), strict=True):
+        value = values[one.name]
+        far = math.exp(_BAND * sd / value) if one.positive else 0.0
         estimates.append(
             Estimate(
                 name=one.name,
                 unit=one.unit,
-                value=one.at(z),
-                sd=sd * abs(one.slope(z)),
-                low=one.at(z - _BAND * sd),
-                high=one.at(z + _BAND * sd),
+                value=value,
+                sd=sd,
+                low=value / far if far else value - _BAND * sd,
+                high=value * far if far else value + _BAND * sd,
                 prior=float(scene.delay) if one.name == "delay" else one.value,
                 prior_sd=before * abs(one.slope(0.0)),
-                told="data" if sd <= 0.5 * before else "prior",
+                told="data" if sd <= 0.5 * before * abs(slope) else "prior",
             )
         )
     return tuple(estimates)
 
 
-def _correlation(covariance: np.ndarray) -> np.ndarray:
+def _correlation(parameters: Parameters, z: np.ndarray, known: Information) -> np.ndarray:
+    gradient = parameters.gradient(z)
+    covariance = gradient @ known.covariance @ gradient.T
     sd = np.sqrt(np.diag(covariance))
     return np.asarray(covariance / np.outer(sd, sd))
 

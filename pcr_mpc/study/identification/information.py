@@ -101,11 +101,9 @@ def _untold(parameters: Parameters, root: np.ndarray, z: np.ndarray) -> tuple[st
 
 def scale_direction(parameters: Parameters, z: np.ndarray) -> np.ndarray:
     """Direction of z in which all forces and masses that are free grow in proportion, shape (F,)."""
-    values, slopes = parameters.values(z), parameters.slopes(z)
-    return np.array(
-        [values[one.name] / slope if one.last in SCALED else 0.0
-         for one, slope in zip(parameters.free, slopes, strict=True)]
-    )  # fmt: skip
+    values = parameters.values(z)
+    grown = np.array([values[one.name] if one.last in SCALED else 0.0 for one in parameters.free])
+    return np.asarray(np.linalg.lstsq(parameters.gradient(z), grown, rcond=None)[0])
 
 
 def _spoken(names: Sequence[str]) -> str:

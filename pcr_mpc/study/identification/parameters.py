@@ -28,7 +28,8 @@ _OF_ROD = {"bending_stiffness": "N m^2", "length": "m", "base_x": "m", "base_y":
 _OF_ROBOT = {"tip_mass": "kg", "drag": "N s/m"}
 _POSITIVE = ("bending_stiffness", "length", "line_density", "tip_mass", "drag")
 # Parameters that share one scale, which motion does not show: forces in proportion, masses in proportion.
-SCALED = ("bending_stiffness", "line_density", "tip_mass", "drag", "force_x", "force_y")
+_FORCES = ("force_x", "force_y")
+SCALED = ("bending_stiffness", "line_density", "tip_mass", "drag", *_FORCES)
 
 
 @dataclass(frozen=True)
@@ -94,12 +95,25 @@ class Parameters:
     root: np.ndarray
 
     def values(self, z: np.ndarray) -> dict[str, float]:
-        """Value of every parameter."""
-        return self.held | {one.name: one.at(float(each)) for one, each in zip(self.free, z, strict=True)}
+        """Value of every parameter.
 
-    def slopes(self, z: np.ndarray) -> np.ndarray:
-        """Derivative of each free one's value in its z."""
-        return np.array([one.slope(float(each)) for one, each in zip(self.free, z, strict=True)])
+        A force is believed in proportion to the tip's mass, so that what motion does not show, one scale of all forces
+        and masses, is a straight line in z.
+        """
+        values = self.held | {one.name: one.at(float(each)) for one, each in zip(self.free, z, strict=True)}
+        heavier = values["tip_mass"] / self.robot.tip_mass
+        return values | {one.name: heavier * values[one.name] for one in self.free if one.last in _FORCES}
+
+    def gradient(self, z: np.ndarray) -> np.ndarray:
+        """Derivatives of the free ones' values (rows) in z (columns), shape (F, F)."""
+        slopes = np.array([one.slope(float(each)) for one, each in zip(self.free, z, strict=True)])
+        gradient, mass, values = np.diag(slopes), self.index("tip_mass"), self.values(z)
+        for i, one in enumerate(self.free):
+            if one.last in _FORCES:
+                gradient[i, i] *= values["tip_mass"] / self.robot.tip_mass
+                if mass is not None:
+                    gradient[i, mass] = values[one.name] * slopes[mass] / values["tip_mass"]
+        return gradient
 
     def robot_at(self, z: np.ndarray) -> Robot:
         """Robot with these numbers.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -91,6 +92,7 @@ class Predictor:
         self._unknown = [np.argwhere(np.isnan(log.u)) for log in self.logs]
         self._plants: dict[tuple[int, bool], Plant] = {}
         self._robot = scene.robot
+        self._at: dict[Piece, tuple[Any, Predicted]] = {}  # where the last derivatives of each piece were taken
 
     def missing(self, log: int) -> int:
         """How many commands of a log are missing."""
@@ -143,7 +145,15 @@ class Predictor:
         self, parameters: Parameters, z: np.ndarray, missing: np.ndarray, piece: Piece, start: np.ndarray
     ) -> Predicted:
         """States of a piece and their derivatives; errors as `states`."""
-        values, slopes, log = parameters.values(z), parameters.slopes(z), piece.log
+        key = (parameters.values(z), parameters.free, piece, missing.tobytes(), start.tobytes())
+        if key != self._at.get(piece, (None, None))[0]:
+            self._at[piece] = key, self._derivatives(parameters, z, missing, piece, start)
+        return self._at[piece][1]
+
+    def _derivatives(
+        self, parameters: Parameters, z: np.ndarray, missing: np.ndarray, piece: Piece, start: np.ndarray
+    ) -> Predicted:
+        values, log = parameters.values(z), piece.log
         substeps, unknown = self.substeps[log], self._unknown[log]
         delay, u = self.delay(log, values), self._commands(log, missing)
         told = commands(self.logs[log], u, delay, piece.first, piece.last, substeps)
@@ -160,12 +170,13 @@ class Predictor:
         found = sensitivities(plant, start, told.rates, [values[name] for name in force], guess=self.pose, ways=ways)
         at = slice(None, None, substeps)
         along = {"delay": 0, force[0]: 1, force[1]: 2}
-        by_free = np.zeros((len(found.x[at]), found.x.shape[1], len(parameters.free)))
+        by_value = np.zeros((len(found.x[at]), found.x.shape[1], len(parameters.free)))
         for j, one in enumerate(parameters.free):
             if one.name in along:
-                by_free[:, :, j] = found.dx_dways[at, :, along[one.name]] * slopes[j]
+                by_value[:, :, j] = found.dx_dways[at, :, along[one.name]]
             elif one.name in found.names:
-                by_free[:, :, j] = found.dx_dnumbers[at, :, found.names.index(one.name)] * slopes[j]
+                by_value[:, :, j] = found.dx_dnumbers[at, :, found.names.index(one.name)]
+        by_free = by_value @ parameters.gradient(z)
         return Predicted(found.x[at], found.dx_dx0[at], by_free, found.dx_dways[at, :, 3:])
 
     def _commands(self, log: int, missing: np.ndarray) -> np.ndarray:
@@ -181,7 +192,10 @@ class Predictor:
             if fine:
                 settings = replace(self._fine, dt=self.logs[log].step / self.fine_steps(log))
             else:
-                settings = replace(self._fine, integrator="rk4", dt=self.logs[log].step / self.substeps[log])
+                # Mass of rods as it is at the start has derivatives that take a tenth of the time.
+                inertia = "constant" if self._fine.inertia == "condensed" else self._fine.inertia
+                step = self.logs[log].step / self.substeps[log]
+                settings = replace(self._fine, integrator="rk4", inertia=inertia, dt=step)
             self._plants[key] = settings.make(self._robot)
         return self._plants[key]
 

@@ -111,8 +111,8 @@ class Problem:
         self._at_missing = np.cumsum([0, *counts]) + len(self.pieces) * (4 + n)
         self.size = int(self._at_missing[-1]) + len(parameters.free)
         self.n_readings, self.growth = 0, 0.0
-        self._of_angle = [parameters.index(f"motor_zero[{i}]") for i in range(n)]
-        self._of_tip = [parameters.index(f"tip_offset_{axis}") for axis in "xy"]
+        self._sensors = [*(f"tip_offset_{axis}" for axis in "xy"), *(f"motor_zero[{i}]" for i in range(n))]
+        self._of_sensors = [parameters.index(name) for name in self._sensors]
 
     def packed(self, guess: Guess) -> np.ndarray:
         """One vector of all unknowns, shape (size,)."""
@@ -127,12 +127,6 @@ class Problem:
         at = self._at_missing
         missing = [vector[a:b] * scale for a, b, scale in zip(at[:-1], at[1:], self._of_missing, strict=True)]
         return Guess(vector[at[-1] :].copy(), tuple(missing), starts)
-
-    def residuals(self, vector: np.ndarray) -> np.ndarray:
-        """All residuals; errors as `Predictor.states`."""
-        guess = self.unpacked(vector)
-        states = self.predictor.states(self.parameters, guess.z, guess.missing, self.pieces, guess.starts)
-        return self._assembled(vector, self._corrected(states), None)[0]
 
     def linearised(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals and their Jacobian, shape (rows, size); errors as `Predictor.states`."""
@@ -149,9 +143,7 @@ class Problem:
             slope[:, :, self._at_missing[-1] :] = found.by_free
             states.append(found.x)
             slopes.append(slope)
-        residuals, jacobian = self._assembled(vector, self._corrected(states), slopes)
-        assert jacobian is not None
-        return residuals, jacobian
+        return self._assembled(vector, self._corrected(states), slopes)
 
     def loss(self, residuals: np.ndarray) -> float:
         """Half the sum of squares, or of Huber's loss of the readings."""
@@ -179,7 +171,7 @@ class Problem:
 
     def compared(self, z: np.ndarray, states: Sequence[np.ndarray]) -> Readings:
         """Residuals log by log of the states of all pieces."""
-        values = self.parameters.values(z)
+        offsets = self._offsets(z)
         tips, angles, all_states = [], [], []
         for number, log in enumerate(self.predictor.logs):
             x = np.full((len(log.t), 4 + self.predictor.n), np.nan)
@@ -187,10 +179,8 @@ class Problem:
                 if piece.log == number:
                     count = len(state) - piece.joined
                     x[piece.first : piece.first + count] = state[:count]
-            offset = np.array([values[f"tip_offset_{axis}"] for axis in "xy"])
-            zeros = np.array([values[f"motor_zero[{i}]"] for i in range(self.predictor.n)])
-            tips.append((x[:, :2] + offset - log.p) / self.noise[number].tip)
-            angles.append((x[:, 4:] + zeros - log.q) / self.noise[number].angle)
+            tips.append((x[:, :2] + offsets[:2] - log.p) / self.noise[number].tip)
+            angles.append((x[:, 4:] + offsets[2:] - log.q) / self.noise[number].angle)
             all_states.append(x)
         return Readings(tips, angles, all_states)
 
@@ -200,50 +190,41 @@ class Problem:
         return [x + change for x, change in zip(states, self.corrections, strict=True)]
 
     def _assembled(
-        self, vector: np.ndarray, states: Sequence[np.ndarray], slopes: Sequence[np.ndarray] | None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+        self, vector: np.ndarray, states: Sequence[np.ndarray], slopes: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
         guess, n, first_free = self.unpacked(vector), self.predictor.n, int(self._at_missing[-1])
-        values = self.parameters.values(guess.z)
-        by_z = self.parameters.slopes(guess.z)
+        by_z, n_states = np.diag(self.parameters.gradient(guess.z)), 4 + n
+        offsets, columns = self._offsets(guess.z), [0, 1, *range(4, n_states)]
         rows: list[np.ndarray] = []
         lines: list[np.ndarray] = []
-        offset = np.array(
-            [*(values[f"tip_offset_{axis}"] for axis in "xy"), *(values[f"motor_zero[{i}]"] for i in range(n))]
-        )
-        columns = [0, 1, *range(4, 4 + n)]
-        for i, (piece, x) in enumerate(zip(self.pieces, states, strict=True)):
+        for piece, x, slope in zip(self.pieces, states, slopes, strict=True):
             log, noise = self.predictor.logs[piece.log], self.noise[piece.log]
-            last = piece.last if piece.joined else piece.last + 1
-            at = slice(piece.first, last)
+            at = slice(piece.first, piece.last if piece.joined else piece.last + 1)
             seen = np.hstack([log.p[at], log.q[at]])
             scale = np.array([noise.tip] * 2 + [noise.angle] * n)
-            rest = (x[: len(seen), columns] + offset - seen) / scale
+            rest = (x[: len(seen), columns] + offsets - seen) / scale
+            by_all = slope[: len(seen), columns] / scale[:, None]
+            for j, index in enumerate(self._of_sensors):
+                if index is not None:
+                    by_all[:, j, first_free + index] += by_z[index] / scale[j]
             known = ~np.isnan(rest)
             rows.append(rest[known])
-            if slopes is not None:
-                slope = slopes[i][: len(seen), columns] / scale[:, None]
-                for j, index in enumerate([*self._of_tip, *self._of_angle]):
-                    if index is not None:
-                        slope[:, j, first_free + index] += by_z[index] / scale[j]
-                lines.append(slope[known])
+            lines.append(by_all[known])
         self.n_readings = sum(map(len, rows))
-        n_states = 4 + n
-        for i, (piece, x) in enumerate(zip(self.pieces, states, strict=True)):
+        for i, (piece, x, slope) in enumerate(zip(self.pieces, states, slopes, strict=True)):
             if not piece.joined:
                 continue
             noise = self.noise[piece.log]
             gap = self.joint * np.array([noise.tip] * 2 + [noise.tip * self.predictor.omega] * 2 + [noise.angle] * n)
             rows.append((x[-1] - guess.starts[i + 1]) / gap)
-            if slopes is not None:
-                slope = slopes[i][-1].copy()
-                slope[:, (i + 1) * n_states : (i + 2) * n_states] -= np.diag(self.scales)
-                lines.append(slope / gap[:, None])
-        rows += [vector[:first_free] / np.where(np.arange(first_free) < len(self.pieces) * n_states, _START, 1.0)]
-        rows.append(self.parameters.root @ guess.z)
-        if slopes is None:
-            return np.concatenate(rows), None
-        believed = np.zeros((self.size, self.size))
-        weak = np.where(np.arange(first_free) < len(self.pieces) * n_states, _START, 1.0)
-        believed[:first_free, :first_free] = np.diag(1.0 / weak)
+            by_all = slope[-1].copy()
+            by_all[:, (i + 1) * n_states : (i + 2) * n_states] -= np.diag(self.scales)
+            lines.append(by_all / gap[:, None])
+        believed = np.diag(1.0 / np.where(np.arange(self.size) < len(self.pieces) * n_states, _START, 1.0))
         believed[first_free:, first_free:] = self.parameters.root
-        return np.concatenate(rows), np.concatenate([*lines, believed])
+        return np.concatenate([*rows, believed @ vector]), np.concatenate([*lines, believed])
+
+    def _offsets(self, z: np.ndarray) -> np.ndarray:
+        """What the sensors add to position and angles."""
+        values = self.parameters.values(z)
+        return np.array([values[name] for name in self._sensors])

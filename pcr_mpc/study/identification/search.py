@@ -230,7 +230,7 @@ def held_fit(
     size = Noise(_MISFIT * float(parameters.robot.lengths.mean()), _MISFIT)
     try:
         problem = Problem(predictor, held, pieces, [size] * len(predictor.logs), guess, robust=True)
-        vector = solve(problem, problem.packed(guess), enough=1e-4).vector
+        vector = solve(problem, problem.packed(guess), enough=1e-2).vector
         states = predictor.states(held, np.zeros(0), guess.missing, pieces, problem.unpacked(vector).starts, fine=True)
     except (PCRError, IdentificationError):
         return None

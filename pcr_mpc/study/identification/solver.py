@@ -14,7 +14,8 @@ from .problem import Problem
 
 _MOST_ITERATIONS = 60
 # A step that promises less than this of half a chi squared is none: no estimate moves by a hundredth of its deviation.
-_PROMISE = 1e-6
+_PROMISE = 1e-5
+_LITTLE = 1e-3  # of half a chi squared, in two steps one after the other
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e12
 
 
@@ -55,7 +56,7 @@ def solve(
     IdentificationError
         No convergence.
     """
-    vector, damping, refused = start.copy(), 1e-3, 0
+    vector, damping, refused, little = start.copy(), 1e-3, 0, 0
     residuals, jacobian = problem.linearised(vector)
     loss = problem.loss(residuals)
     for iteration in range(1, _MOST_ITERATIONS + 1):
@@ -72,10 +73,11 @@ def solve(
                 rcond=1e-15,
             )[0]
             promised = 0.5 * float(target @ target - np.sum((triangle @ step - target) ** 2))
-            if promised <= max(_PROMISE, enough * loss):
+            if promised <= max(_PROMISE, enough * loss) or little > 1:
                 return Solution(vector, loss, iteration, refused, weights * residuals, weighted)
-            new_loss = _loss(problem, vector + step)
-            gain = (loss - new_loss) / promised
+            # With the derivatives at once: steps that are refused are few.
+            new = _tried(problem, vector + step)
+            gain = (loss - new[0]) / promised
             if gain > 0.05:
                 break
             refused += 1
@@ -86,19 +88,22 @@ def solve(
         damping *= 0.1 if gain > 0.6 else 0.5 if gain > 0.25 else 2.0
         if damping < _LEAST_DAMPING:  # else what was believed, and nothing else tells, would count for less
             damping = 0.0
-        residuals, jacobian = problem.linearised(vector)
-        loss = problem.loss(residuals)
+        gained = loss - new[0]
+        loss, residuals, jacobian = new
         tell(loss)
+        little = little + 1 if gained < _LITTLE else 0
     raise IdentificationError(
         f"no convergence in {_MOST_ITERATIONS} steps (half a chi squared of {loss:.4g}); free fewer parameters, or "
         "record a motion that moves more"
     )
 
 
-def _loss(problem: Problem, vector: np.ndarray) -> float:
+def _tried(problem: Problem, vector: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Loss, residuals and Jacobian; an infinite loss where the rods do not follow."""
     try:
         with np.errstate(all="ignore"):
-            loss = problem.loss(problem.residuals(vector))
+            residuals, jacobian = problem.linearised(vector)
+            loss = problem.loss(residuals)
     except (PCRError, ValueError):
-        return np.inf
-    return loss if np.isfinite(loss) else np.inf
+        return np.inf, np.empty(0), np.empty((0, 0))
+    return (loss if np.isfinite(loss) else np.inf), residuals, jacobian
