@@ -140,11 +140,13 @@ def parser() -> argparse.ArgumentParser:
                           "columns t_s, p_x_m, p_y_m, q0_rad, ..., u0_rad_s, ... at a uniform rate; cells may be "
                           "empty and rows missing")  # fmt: skip
     identity.add_argument("--free", action="append", metavar="NAMES", help="what is unknown, separated by commas: "
-                          "bending_stiffness, length, base, line_density (of all rods, or as rods[0].length), tip_mass, "
-                          "drag, motor_zero, tip_offset, delay, force; default stands for bending_stiffness, tip_mass, "
-                          "drag, base, delay and force, as in --free default,motor_zero")  # fmt: skip
-    identity.add_argument("--fix", action="append", default=[], metavar="NAME=VALUE", help="a number that is known, in "
-                          "SI units, as tip_mass=0.251 of a tip that was weighed; delay in control periods")  # fmt: skip
+                          "bending_stiffness, length, base, line_density (of all rods, or as rods[0].length), "
+                          "tip_mass, drag, motor_zero, tip_offset, delay, force; default stands for "
+                          "bending_stiffness, tip_mass, drag, base, delay and force, as in --free "
+                          "default,motor_zero")  # fmt: skip
+    identity.add_argument("--fix", action="append", default=[], metavar="NAME=VALUE", help="a number that is known, "
+                          "in SI units, as tip_mass=0.251 of a tip that was weighed; delay in control "
+                          "periods")  # fmt: skip
     identity.add_argument("--validate", action="append", default=[], metavar="LOG", help="log that is only predicted")
     identity.add_argument("--loss", choices=("auto", "squares", "huber"), default="auto",
                           help="huber bears outliers; auto takes it where there are some (default)")  # fmt: skip

@@ -218,4 +218,6 @@ def _draw_gain(axes: Any, estimates: Sequence[Estimate]) -> None:
     axes.barh(places, gains, color=colours, height=0.6)
     axes.axvline(2.0, color=RED, lw=0.9, ls="--")
     axes.set_yticks(places, [one.name for one in estimates], fontsize=8)
-    axes.set(xscale="log", xlabel="standard deviation before / after [-]", title="What the log has told (twice: dashed)")
+    axes.set(
+        xscale="log", xlabel="standard deviation before / after [-]", title="What the log has told (twice: dashed)"
+    )

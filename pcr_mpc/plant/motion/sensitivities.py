@@ -124,8 +124,8 @@ def sensitivities(
         derivatives[k + 1, :, size:both] += slope[:, of_numbers]
         derivatives[k + 1, :, both:] += slope[:, -n_given:] @ ways[k]
     t = plant.dt * np.arange(len(x))
-    parts = (part.copy() for part in np.split(derivatives, [size, both], axis=2))
-    return Sensitivities(t, x, *parts, names=model.kind.names)
+    by_start, by_numbers, by_ways = (part.copy() for part in np.split(derivatives, [size, both], axis=2))
+    return Sensitivities(t, x, by_start, by_numbers, by_ways, model.kind.names)
 
 
 def _all_slopes(

@@ -72,7 +72,7 @@ def _angle(u: np.ndarray, times: np.ndarray) -> np.ndarray:
     knots = np.concatenate([np.zeros((1, u.shape[1])), np.cumsum(u, axis=0)])
     rows = np.arange(len(knots))
     before = np.minimum(times, 0.0)[:, None] * u[0]
-    return np.stack([np.interp(times, rows, column) for column in knots.T], axis=1) + before
+    return np.asarray(np.stack([np.interp(times, rows, column) for column in knots.T], axis=1) + before)
 
 
 def _rate(u: np.ndarray, times: np.ndarray) -> np.ndarray:

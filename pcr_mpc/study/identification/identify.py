@@ -77,8 +77,8 @@ def identify(
     if not logs:
         raise IdentificationError("there is no log; record one with `pcr-mpc track`, or on the robot")
     pose = scene.start()
-    logs = [checked_log(log, scene.robot, pose.q) for log in logs]
-    others = [checked_log(log, scene.robot, pose.q) for log in validate]
+    logs = [checked_log(log, scene.robot, pose) for log in logs]
+    others = [checked_log(log, scene.robot, pose) for log in validate]
     guess = _delay(scene, logs)
     longest = max(math.ceil(guess) + 1.0 if guess is not None else float(LONGEST_DELAY), float(scene.delay))
     everything = catalogue(scene.robot, len(logs), scene.delay if guess is None else guess, longest)
@@ -100,12 +100,15 @@ def identify(
             bar.update()
 
         found = search(predictor, parameters, loss, tell, try_delays=guess is None)
-        fits = _fits(predictor, found, scene, tell)
+        fits = _fits(predictor, found, scene)
         _require_explained(fits, found, scene)
-        coloured = whiteness([channel for fit in fits for channel in fit.tip.T])
+        # Below the least noise that is believed there is nothing but rounding to look at.
+        coloured = whiteness(
+            [channel for fit in fits if (fit.rms() or 0.0) > fit.noise.tip / 2.0 for channel in fit.tip.T]
+        )
         widened = coloured.widening if not coloured.white else 1.0
         known = information(found.problem, found.jacobian, found.z, widened)
-        validation = _validation(scene, others, parameters, found.z, tell) if others else ()
+        validation = _validation(scene, others, parameters, found.z) if others else ()
     values = parameters.values(found.z)
     forces = tuple((values[x], values[y]) for x, y in (force_names(i, len(logs)) for i in range(len(logs))))
     estimates = _estimates(parameters, found, known, scene)
@@ -140,7 +143,7 @@ def _delay(scene: Scene, logs: Sequence[Log]) -> float | None:
     return None if told else 0.0
 
 
-def _fits(predictor: Predictor, found: Found, scene: Scene, tell: object) -> tuple[Fit, ...]:
+def _fits(predictor: Predictor, found: Found, scene: Scene) -> tuple[Fit, ...]:
     believed = found.problem.parameters
     values = believed.values(np.zeros(len(believed.free)))
     before = held_fit(predictor, found.problem.parameters, values | {"delay": float(scene.delay)}, found.problem.noise)
@@ -149,13 +152,11 @@ def _fits(predictor: Predictor, found: Found, scene: Scene, tell: object) -> tup
     for i, log in enumerate(predictor.logs):
         tip, angle = readings.tip[i] * noise[i].tip, readings.angle[i] * noise[i].angle
         outliers = int((np.abs(readings.tip[i]) > 6.0).sum() + (np.abs(readings.angle[i]) > 6.0).sum())
-        fits.append(Fit(log, before and before.x[i], readings.x[i], tip, angle, noise[i], outliers))
+        fits.append(Fit(log, before.x[i] if before else None, readings.x[i], tip, angle, noise[i], outliers))
     return tuple(fits)
 
 
-def _validation(
-    scene: Scene, logs: Sequence[Log], parameters: Parameters, z: np.ndarray, tell: object
-) -> tuple[Fit, ...]:
+def _validation(scene: Scene, logs: Sequence[Log], parameters: Parameters, z: np.ndarray) -> tuple[Fit, ...]:
     """Predict logs that were not used, from the start that suits each best; the force is the mean of the others'."""
     predictor = Predictor(scene, logs)
     values = parameters.values(z)
@@ -177,7 +178,9 @@ def _validation(
     for i, log in enumerate(predictor.logs):
         tip, angle = after.tip[i], after.angle[i]  # noise is 1 m and 1 rad there
         channels = list(tip.T)
-        fits.append(Fit(log, before and before.x[i], after.x[i], tip, angle, Noise(change_noise(channels), 0.0), 0))
+        fits.append(
+            Fit(log, before.x[i] if before else None, after.x[i], tip, angle, Noise(change_noise(channels), 0.0), 0)
+        )
     return tuple(fits)
 
 

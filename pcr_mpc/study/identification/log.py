@@ -205,7 +205,7 @@ def _on_a_grid(path: Path, t: np.ndarray, p: np.ndarray, q: np.ndarray, u: np.nd
             arrays.append(grid)
         name = f"{path}" if len(ends) == 1 else f"{path} (part {number + 1})"
         times = t[first] + step * np.arange(places[-1] + 1)
-        logs.append(_with_commands(Log(name, step, times, *arrays)))
+        logs.append(_with_commands(Log(name, step, times, arrays[0], arrays[1], arrays[2])))
     return logs
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...errors import LogError
 from ...plant.robot import Robot
+from ...plant.statics.equilibrium import Equilibrium
 from .commands import told_angles
 from .log import Log
 
@@ -21,6 +22,8 @@ _BESIDE_STOPS = 0.3
 # Share of readings that must make sense.
 _MOST = 0.9
 _ALIKE = 0.12
+# Distance from the scene's start, in rod lengths, within which a tip in other units is looked for.
+_NEAR = 0.4
 # Angle told over angle seen, were it in other units.
 _UNITS = {
     180.0 / math.pi: "q{i}_rad changes 57.3 times as much as u{i}_rad_s tells: the angles look like degrees, or the "
@@ -39,15 +42,15 @@ _UNITS = {
 }
 
 
-def checked_log(log: Log, robot: Robot, q_start: np.ndarray) -> Log:
+def checked_log(log: Log, robot: Robot, pose: Equilibrium) -> Log:
     """Return a log with its angles unwrapped, or say why it cannot be this robot's.
 
     Parameters
     ----------
     log : Log
     robot : Robot
-    q_start : ndarray, shape (n,)
-        Motor angles of the scene's start, to whose turn those of the log belong [rad].
+    pose : Equilibrium
+        Of the scene's start: near it is the tip, and to its turns belong the angles.
 
     Raises
     ------
@@ -61,10 +64,10 @@ def checked_log(log: Log, robot: Robot, q_start: np.ndarray) -> Log:
             f"is too short: {log.t[-1] - log.t[0]:.3g} s with {seen} tip positions; record {_LEAST_TIME:g} s and "
             f"{_LEAST_ROWS} positions at least, better some seconds",
         )
-    _check_tip(log, robot)
+    _check_tip(log, robot, pose.p)
     if not np.isnan(log.q).all():
         _check_angles(log, robot)
-        log = _unwrapped(log, robot, q_start)
+        log = _unwrapped(log, robot, pose.q)
         if log.driven_by == "commands":
             _check_rates(log)
     if np.nanmax(np.abs(log.u)) * log.step < 1e-7 and np.nanmax(np.nanstd(log.p, axis=0)) < 1e-6:
@@ -96,7 +99,7 @@ def _failure(log: Log, problem: str) -> LogError:
     return LogError(f"{log.name}: {problem}", file=log.name)
 
 
-def _check_tip(log: Log, robot: Robot) -> None:
+def _check_tip(log: Log, robot: Robot, p_start: np.ndarray) -> None:
     p = log.p[~np.isnan(log.p).any(axis=1)]
     if not len(p):
         return  # one coordinate alone
@@ -108,7 +111,8 @@ def _check_tip(log: Log, robot: Robot) -> None:
     if reached(1.0) >= _MOST:
         return
     for scale, unit in ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e-6, "micrometres")):
-        if reached(scale) >= _MOST:
+        near = np.linalg.norm(scale * np.median(p, axis=0) - p_start) < _NEAR * float(robot.lengths.mean())
+        if near and reached(scale) >= _MOST:
             raise _failure(log, f"p_x_m, p_y_m look like {unit}, at {p[0].tolist()}; write metres")
     raise _failure(
         log,
@@ -157,19 +161,11 @@ def _unwrapped(log: Log, robot: Robot, q_start: np.ndarray) -> Log:
 
 def _check_rates(log: Log) -> None:
     """Refuse angles that are not what the commands add up to."""
-    for i, told in enumerate(told_angles(log, delay_in_angles(log) or 0.0).T):
-        known = ~np.isnan(log.q[:, i]) & ~np.isnan(told)
-        known[:LONGEST_DELAY] = False
-        x, y = told[known], log.q[known, i]
-        if len(x) < 10 or np.ptp(x) < 1e-12:
-            continue
-        for _ in range(4):  # without outliers
-            slope, offset = np.polyfit(x, y, 1)
-            rest = np.abs(y - slope * x - offset)
-            keep = rest <= 4.0 * np.median(rest) + 1e-12
-            x, y = x[keep], y[keep]
-        explained = 1.0 - np.var(y - slope * x - offset) / max(float(np.var(y)), 1e-300)
-        if abs(slope - 1.0) <= _ALIKE or np.ptp(y) < 0.02 or explained < 0.5:
+    for i in range(log.q.shape[1]):
+        # In other units the delay that fits best is none: that of the best line is.
+        lines = [_line(log, i, delay) for delay in range(LONGEST_DELAY + 1)]
+        slope, explained, moved = max(lines, key=lambda line: line[1])
+        if abs(slope - 1.0) <= _ALIKE or moved < 0.02 or explained < 0.5:
             continue
         for ratio, words in _UNITS.items():
             if abs(slope / ratio - 1.0) < _ALIKE:
@@ -179,3 +175,20 @@ def _check_rates(log: Log) -> None:
             f"q{i}_rad changes {slope:.3g} times as much as u{i}_rad_s tells; check the units, and whether the motor "
             "follows its commands",
         )
+
+
+def _line(log: Log, motor: int, delay: int) -> tuple[float, float, float]:
+    """Slope of the angle over what was told, the share of its variance that this explains, and its range [rad]."""
+    told = told_angles(log, float(delay))[:, motor]
+    known = ~np.isnan(log.q[:, motor])
+    known[:LONGEST_DELAY] = False
+    x, y = told[known], log.q[known, motor]
+    if len(x) < 10 or np.ptp(x) < 1e-12:
+        return 1.0, 0.0, 0.0
+    for _ in range(4):  # without outliers
+        slope, offset = np.polyfit(x, y, 1)
+        rest = np.abs(y - slope * x - offset)
+        keep = rest <= 4.0 * np.median(rest) + 1e-12
+        x, y = x[keep], y[keep]
+    explained = 1.0 - np.var(y - slope * x - offset) / max(float(np.var(y)), 1e-300)
+    return float(slope), float(explained), float(np.ptp(y))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...errors import IdentificationError
-from ...plant.robot import Robot, Rod
+from ...plant.robot import Robot
 from ...plant.uncertainty import Uncertainty
 
 # Standard deviations where the robot's file does not say: those of the ranges of `Spread`, of which the reasons stand
@@ -25,8 +25,6 @@ _DELAY = 3.0  # rows of the log
 # What a lab does not know.
 DEFAULT = ("bending_stiffness", "tip_mass", "drag", "base", "delay", "force")
 _OF_ROD = {"bending_stiffness": "N m^2", "length": "m", "base_x": "m", "base_y": "m", "line_density": "kg/m"}
-_OF_ROBOT = {"tip_mass": "kg", "drag": "N s/m"}
-_POSITIVE = ("bending_stiffness", "length", "line_density", "tip_mass", "drag")
 # Parameters that share one scale, which motion does not show: forces in proportion, masses in proportion.
 _FORCES = ("force_x", "force_y")
 SCALED = ("bending_stiffness", "line_density", "tip_mass", "drag", *_FORCES)
@@ -132,13 +130,20 @@ class Parameters:
 
 def robot_with(robot: Robot, values: Mapping[str, float]) -> Robot:
     """Robot with other numbers, as far as they are given."""
-    rods: list[Rod] = []
+    rods = []
     for i, rod in enumerate(robot.rods):
-        own = {name: values.get(f"rods[{i}].{name}") for name in _OF_ROD}
-        base = tuple(rod.base[j] if own[key] is None else float(own[key]) for j, key in enumerate(("base_x", "base_y")))  # type: ignore[arg-type]
-        rest = {name: value for name, value in own.items() if value is not None and not name.startswith("base")}
-        rods.append(replace(rod, base=(base[0], base[1]), **rest))
-    return replace(robot, rods=tuple(rods), **{name: values[name] for name in _OF_ROBOT if name in values})
+        whose = f"rods[{i}]"
+        rods.append(
+            replace(
+                rod,
+                base=(values.get(f"{whose}.base_x", rod.base[0]), values.get(f"{whose}.base_y", rod.base[1])),
+                length=values.get(f"{whose}.length", rod.length),
+                bending_stiffness=values.get(f"{whose}.bending_stiffness", rod.bending_stiffness),
+                line_density=values.get(f"{whose}.line_density", rod.line_density),
+            )
+        )
+    tip_mass, drag = values.get("tip_mass", robot.tip_mass), values.get("drag", robot.drag)
+    return replace(robot, rods=tuple(rods), tip_mass=tip_mass, drag=drag)
 
 
 def force_names(log: int, logs: int) -> tuple[str, str]:

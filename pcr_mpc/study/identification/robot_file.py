@@ -23,7 +23,9 @@ def robot_path(scene_file: Path) -> Path:
     return scene_file.parent / str(read_toml(scene_file).text("robot"))
 
 
-def write_robot(found: Identification, base: Robot, path: Path, comments: Sequence[str], *, force: bool = False) -> None:
+def write_robot(
+    found: Identification, base: Robot, path: Path, comments: Sequence[str], *, force: bool = False
+) -> None:
     """Write a robot with the estimates, under some lines of comment.
 
     Parameters
@@ -89,7 +91,7 @@ def _toml(robot: Robot, uncertainty: Uncertainty | None, comments: Sequence[str]
         lines += ["", "[world]", _line("gravity", list(robot.gravity), "m/s^2")]
     if uncertainty is not None:
         names = ", ".join(f'"{name}"' for name in uncertainty.names)
-        rows = (", ".join(f"{value:.6f}" for value in row) for row in uncertainty.correlation)
+        rows = (", ".join(f"{value:.12f}" for value in row) for row in uncertainty.correlation)
         lines += [
             "",
             "[uncertainty]             # how well these numbers are known; pcr-mpc identify starts from it",
@@ -135,4 +137,4 @@ def _plain(value: float | tuple[float, ...]) -> float | list[float]:
 
 
 def _line(key: str, value: object, comment: str) -> str:
-    return f"{f'{key} = {value!r}':40}# {comment}"
+    return f"{f'{key} = {value!r}':38}  # {comment}"

@@ -25,6 +25,8 @@ _LONGEST_RUN = 20.0  # s
 _JOINTS = (10.0, 0.3, 1e-3)
 _ROUNDS = 8
 _MISFIT = 1e-3
+# Share of the tip's motion that loose pieces may leave.
+_UNLIKE = 0.05
 _SETTLED = 0.02
 # Readings this far off are outliers, in standard deviations; and how many are worth another loss.
 _OUTLIER, _WORTH, _GROSS = 6.0, 1e-3, 20.0
@@ -121,7 +123,9 @@ class _Search:
         guess = self.guess
         for joint in joints[:-1]:
             problem = self._problem(joint)
-            guess = problem.unpacked(self._solved(problem, guess).vector)
+            vector = self._solved(problem, guess).vector
+            guess = problem.unpacked(vector)
+            self._require_likely(problem.readings(vector))
         if self.whole:
             self._require_suited(self._problem(joints[-1]), guess)
         for _ in range(_ROUNDS):
@@ -132,10 +136,7 @@ class _Search:
             settled = self._learnt(problem, readings, guess)
             if settled:
                 break
-        off = np.concatenate([
-            (tip * noise.tip).ravel() for tip, noise in zip(readings.tip, self.noise, strict=True)
-        ])  # fmt: skip
-        distance = 1.4826 * math.sqrt(2.0) * float(np.nanmedian(np.abs(off)))
+        distance = self._distance(readings)
         lost = self.whole and distance > 0.02 * float(self.parameters.robot.lengths.mean())
         found = Found(problem, guess.z, solution.jacobian, readings, "", self.iterations, self.refused)
         return _Ended(found, distance, lost)
@@ -163,6 +164,23 @@ class _Search:
         if off > _LOST * length:
             raise _Unsuited(f"the believed robot is {1e3 * off:.3g} mm off in one piece")
 
+    def _require_likely(self, readings: Readings) -> None:
+        """Raise where not even loose pieces are like the motion that was seen."""
+        off = self._distance(readings)
+        moved = max(float(np.sqrt(np.nansum(np.nanvar(log.p, axis=0)))) for log in self.predictor.logs)
+        if off > _UNLIKE * moved:
+            raise IdentificationError(
+                f"even in pieces of {SHORT:g} s the best numbers leave {1e3 * off:.3g} mm between prediction and log, "
+                f"where the tip moves by {1e3 * moved:.3g} mm RMS: it is hardly a log of {self.parameters.robot.name}; "
+                "check geometry, units, signs and the start pose of the scene",
+                residual=off,
+            )
+
+    def _distance(self, readings: Readings) -> float:
+        """Of predicted tips from measured ones, outliers aside [m]."""
+        off = [(tip * noise.tip).ravel() for tip, noise in zip(readings.tip, self.noise, strict=True)]
+        return 1.4826 * math.sqrt(2.0) * float(np.nanmedian(np.abs(np.concatenate(off))))
+
     def _best_delay(self, place: int) -> Guess:
         """Try whole delays: the one from which a single step promises the least."""
         best = (np.inf, self.around)
@@ -187,7 +205,7 @@ class _Search:
         settled, unknowns = True, problem.size - len(self.parameters.free)
         for i, (noise, log) in enumerate(zip(self.noise, self.predictor.logs, strict=True)):
             tip, angle = readings.tip[i] * noise.tip, readings.angle[i] * noise.angle
-            if self.loss == "auto" and not self.robust and (_outlying(tip) or _outlying(angle)):
+            if self.loss == "auto" and not self.robust and (_outlying(tip, least.tip) or _outlying(angle, least.angle)):
                 self.robust, settled = True, False
             count = int((~np.isnan(tip)).sum() + (~np.isnan(angle)).sum())
             spare = max(0.1, 1.0 - (unknowns / len(self.predictor.logs) + len(self.parameters.free)) / max(count, 1))
@@ -250,9 +268,9 @@ def _spread(values: np.ndarray, robust: bool) -> float:
     return 1.4826 * float(np.median(np.abs(known))) if robust else float(np.sqrt(np.mean(known**2)))
 
 
-def _outlying(values: np.ndarray) -> bool:
+def _outlying(values: np.ndarray, least: float) -> bool:
     known = np.abs(values[~np.isnan(values)])
     if len(known) < 20:
         return False
-    off = known / max(1.4826 * float(np.median(known)), 1e-300)
+    off = known / max(1.4826 * float(np.median(known)), least)
     return bool((off > _OUTLIER).mean() > _WORTH or off.max() > _GROSS)

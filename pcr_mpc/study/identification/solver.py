@@ -12,7 +12,7 @@ from ... import interrupt
 from ...errors import IdentificationError, PCRError
 from .problem import Problem
 
-_MOST_ITERATIONS = 60
+_MOST_ITERATIONS, _MOST_REFUSED = 40, 30
 # A step that promises less than this of half a chi squared is none: no estimate moves by a hundredth of its deviation.
 _PROMISE = 1e-5
 _LITTLE = 1e-3  # of half a chi squared, in two steps one after the other
@@ -82,6 +82,8 @@ def solve(
                 break
             refused += 1
             damping = max(8.0 * damping, _LEAST_DAMPING)
+            if refused > _MOST_REFUSED:
+                raise _unsolved(f"{refused} steps were refused", loss)
             if damping > _LARGEST_DAMPING:
                 return Solution(vector, loss, iteration, refused, weights * residuals, weighted)
         vector = vector + step
@@ -92,9 +94,14 @@ def solve(
         loss, residuals, jacobian = new
         tell(loss)
         little = little + 1 if gained < _LITTLE else 0
-    raise IdentificationError(
-        f"no convergence in {_MOST_ITERATIONS} steps (half a chi squared of {loss:.4g}); free fewer parameters, or "
-        "record a motion that moves more"
+    raise _unsolved(f"{_MOST_ITERATIONS} steps were not enough", loss)
+
+
+def _unsolved(why: str, loss: float) -> IdentificationError:
+    return IdentificationError(
+        f"no convergence: {why} (half a chi squared of {loss:.4g}); is it a log of this robot? If so, free fewer "
+        "parameters, or record a motion that moves more",
+        loss=loss,
     )
 
 
