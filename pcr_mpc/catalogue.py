@@ -42,16 +42,19 @@ def shipped(name: str, kind: str = "scene") -> Path:
         return _folder(kind) / f"{name}.toml"
     from .errors import ModelError  # loads NumPy, which the parser of the command line must not wait for
 
-    near = difflib.get_close_matches(str(name), names, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names)}"
-    raise ModelError(
-        f"no {kind} named {name!r} comes with the package; {hint}", key=kind, nearest=near[0] if near else None
-    )
+    near = nearest(str(name), kind)
+    hint = f"did you mean {near!r}?" if near else f"there are {', '.join(names)}"
+    raise ModelError(f"no {kind} named {name!r} comes with the package; {hint}", key=kind, nearest=near)
 
 
 def names_of(kind: str) -> list[str]:
     """Names of all that travels with the package and is of a kind."""
     return sorted(path.stem for path in _folder(kind).glob("*.toml"))
+
+
+def nearest(name: str, kind: str) -> str | None:
+    """What somebody may have meant by a name of nothing of a kind."""
+    return next(iter(difflib.get_close_matches(name, names_of(kind), n=1)), None)
 
 
 def kinds_of(name: str) -> list[str]:

@@ -14,7 +14,13 @@ from . import interrupt
 from .cli_parser import LEAST, parser
 
 # Arguments that name a file: a path, or the name of one of these kinds that comes with the package.
-_FILES = {"scene": ("scene",), "robot": ("robot",), "controller": ("tuning",), "start": ("tuning",)}
+_FILES = {
+    "scene": ("scene",),
+    "robot": ("robot",),
+    "target": ("scene", "robot"),
+    "controller": ("tuning",),
+    "start": ("tuning",),
+}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -74,14 +80,14 @@ def _check(options: argparse.Namespace) -> None:
 
 def _found(given: str, kinds: tuple[str, ...]) -> tuple[Path, bool]:
     """File that is meant by a path or a name, and whether it is by a name that it comes with the package."""
-    from .catalogue import is_name, kinds_of, shipped
+    from .catalogue import is_name, kinds_of, nearest, shipped
 
     if not is_name(given):
         return Path(given), False
     kind = next((one for one in kinds_of(given) if one in kinds), None)
     if kind is None and Path(given).is_file():
         return Path(given), False
-    return shipped(given, kind or kinds[0]), True
+    return shipped(given, kind or next((one for one in kinds if nearest(given, one)), kinds[0])), True
 
 
 def _message(error: BaseException, stopped: bool) -> str:

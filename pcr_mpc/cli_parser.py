@@ -25,6 +25,8 @@ examples:
   pcr-mpc timing lemniscate                             step times against the real-time budgets
   pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
   pcr-mpc copy lemniscate mine                          a copy of that scene to change
+  pcr-mpc new mine --diameter 1e-3 --length 0.5         a robot of your own to start from, in mine/
+  pcr-mpc check mine/scene.toml                         what can be said of it without running it
 Where a file is wanted, a name is one of pcr-mpc models; a path, such as ./mine/scene.toml, is that file.
 """
 
@@ -191,6 +193,32 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="tuning to write (default SCENE.toml, beside the scene's tuning if the scene is a file)",
     )
+
+    new = command(
+        "new",
+        "cli_new",
+        "new",
+        "Write a robot, a scene and a tuning to start from into a folder: motors, tip, path and times are chosen so "
+        "that they go together, and the numbers say why.",
+    )
+    new.add_argument("folder", type=Path, metavar="NAME", help="folder to make; its last part names the robot")
+    new.add_argument("--rods", type=int, default=2, help="2 to 4 (default 2)")
+    new.add_argument("--material", default="nitinol", help="of the rods, such as spring_steel (default nitinol)")
+    new.add_argument("--diameter", type=float, default=1e-3, metavar="D", help="of the rods [m] (default 0.001)")
+    new.add_argument("--length", type=float, default=0.5, metavar="L", help="of the rods [m] (default 0.5)")
+    new.add_argument("--spacing", type=float, metavar="S", help="between neighbouring motors [m] (default: chosen)")
+    new.add_argument("--tip-mass", type=float, metavar="M", help="pin and payload [kg] (default: chosen)")
+    new.add_argument("--motor", help="servo, such as XM430-W210 (default: the smallest that has the torque)")
+
+    check = command(
+        "check",
+        "cli_new",
+        "check",
+        "Say all of a robot or a scene that can be said without running it: reach, working modes, torque, strain, "
+        "natural frequencies, step sizes, margins, what the reference asks for. Fails if it cannot run as asked.",
+    )
+    check.add_argument("target", metavar="ROBOT|SCENE", help="a file, or a name of pcr-mpc models")
+    check.add_argument("--picture", type=Path, metavar="FILE", help="draw start, workspace and reference into FILE")
 
     command("models", "cli_shipped", "list_models", "List the robots, scenes and tunings that come with the package.")
 

@@ -1,0 +1,220 @@
+"""All that can be said of a robot or a scene without running it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .. import interrupt
+from ..errors import ModelError, PCRError
+from ..loop.scene import Scene
+from ..plant.motion.plant import Plant
+from ..plant.robot import Robot
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.free_tip import inverse_statics
+from ..plant.statics.stability import assess_stability
+from .demands import demands
+from .reach import Reach, explore, tips_within
+from .remarks import Remark, about_rods, about_start, about_steps, unidentifiable
+
+_CLAMPED_PINNED = 3.9266023  # first root of tan x = tanh x: a rod clamped at its motor, pinned at the tip
+_USUAL_STRETCH = 0.67  # distance of tip and motor over the rod's length, where the shipped robots work
+_TRIES = 24  # of tips at which a robot may be held, before it is given up
+_TIPS = 80  # of the lattice from which these are taken
+
+
+@dataclass(eq=False)
+class Examination:
+    """What was found; it grows while one looks.
+
+    Attributes
+    ----------
+    name : str
+    robot : Robot
+    scene : Scene or None
+    pose : Equilibrium or None
+        At the start of the scene; of a robot, one that it can hold. None if there is none.
+    reach : Reach or None
+        From that pose.
+    path : ndarray, shape (K, 2), or None
+        Of the reference [m].
+    figures : dict
+        Numbers, ready for JSON.
+    remarks : list of Remark
+    """
+
+    name: str
+    robot: Robot
+    scene: Scene | None
+    pose: Equilibrium | None = None
+    reach: Reach | None = None
+    path: np.ndarray | None = None
+    figures: dict[str, Any] = field(default_factory=dict)
+    remarks: list[Remark] = field(default_factory=list)
+
+    @property
+    def errors(self) -> list[Remark]:
+        """What keeps it from running as asked."""
+        return [one for one in self.remarks if one.level == "error"]
+
+
+def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
+    """Examine a robot or a scene; what is wrong with it is a remark, and no exception.
+
+    Parameters
+    ----------
+    what : Robot or Scene
+    modes : bool
+        Whether to look which working modes there are: 2^n searches for n rods.
+    """
+    scene = what if isinstance(what, Scene) else None
+    robot = what.robot if isinstance(what, Scene) else what
+    found = Examination(what.name, robot, scene)
+    found.figures["rods"] = [_rod_figures(robot, i) for i in range(robot.n_rods)]
+    try:
+        found.pose = scene.start() if scene is not None else _usual_pose(robot)
+    except PCRError as error:
+        found.remarks += [Remark("error", "start", str(error)), *unidentifiable(robot)]
+        return found
+    pose = found.pose
+    mass, share = _mass(pose)
+    found.figures["start"] = _pose_figures(pose, mass, share)
+    found.remarks += about_start(pose, robot.torque_limit if scene is None else scene.torque_limit)
+    if modes:
+        found.figures["modes"] = _modes(pose)
+    found.reach = explore(pose)
+    found.figures["workspace"] = _workspace(found.reach)
+    if scene is not None:
+        found.path, reference, remarks = demands(scene, pose)
+        found.figures["reference"] = reference
+        found.remarks += remarks
+        steps, remarks = about_steps(scene, mass, found.figures)
+        found.figures["steps"] = steps
+        found.remarks += remarks
+    found.remarks += about_rods(robot, scene, found.figures)
+    found.remarks += unidentifiable(robot)
+    found.remarks.sort(key=lambda one: ("error", "warning", "note").index(one.level))
+    return found
+
+
+def _usual_pose(robot: Robot) -> Equilibrium:
+    """A pose in which a robot is held with rods about as bent as those of the shipped robots, if there is one.
+
+    Raises
+    ------
+    ModelError
+        None was found.
+    """
+    tips = sorted(
+        tips_within(robot, _TIPS).values(),
+        # Of tips alike the one in front of the motors, y up.
+        key=lambda p: (round(abs(1.0 - min(robot.slacks(p)) - _USUAL_STRETCH), 3), -float(p[1])),
+    )
+    heavy: Equilibrium | None = None
+    for p in tips[:_TRIES]:
+        interrupt.check()
+        try:
+            eq = inverse_statics(robot, p)
+        except PCRError:
+            continue
+        if float(np.abs(eq.motor_torque).max()) <= robot.torque_limit:
+            return eq
+        heavy = heavy or eq
+    if heavy is not None:
+        return heavy
+    raise ModelError(
+        f"{robot.name}: at none of {min(_TRIES, len(tips))} tips within reach was a stable pose found with the motors "
+        "between their stops; look at angle_limits, and at base and length of the rods",
+        key="angle_limits",
+    )
+
+
+def _rod_figures(robot: Robot, i: int) -> dict[str, Any]:
+    rod = robot.rods[i]
+    hertz = None
+    if rod.line_density:
+        rate = (_CLAMPED_PINNED / rod.length) ** 2 * math.sqrt(rod.bending_stiffness / rod.line_density)
+        hertz = rate / (2 * math.pi)
+    return {
+        "length_m": rod.length,
+        "bending_stiffness_Nm2": rod.bending_stiffness,
+        "line_density_kg_m": rod.line_density,
+        "mass_kg": rod.line_density * rod.length,
+        "own_frequency_Hz": hertz,
+        "strain_limit": rod.strain_limit if math.isfinite(rod.strain_limit) else None,
+    }
+
+
+def _mass(eq: Equilibrium) -> tuple[np.ndarray, float]:
+    """Mass that moves with the tip, shape (2, 2) [kg], and the largest share of the rods in it."""
+    robot = eq.robot
+    tip = robot.tip_mass * np.eye(2)
+    if not any(rod.line_density for rod in robot.rods):
+        return tip, 0.0
+    plant = Plant(robot, inertia="condensed")
+    plant.reset(np.concatenate([eq.p, np.zeros(2), eq.q]), eq)
+    mass = plant.mass(eq.p, eq.q)[0][:2, :2]
+    largest = float(np.linalg.eigvalsh(mass)[-1])
+    return mass, 1.0 - robot.tip_mass / largest
+
+
+def _pose_figures(eq: Equilibrium, mass: np.ndarray, share: float) -> dict[str, Any]:
+    inverse = np.linalg.inv(np.linalg.cholesky(mass))
+    rates = np.sqrt(np.maximum(np.linalg.eigvalsh(inverse @ eq.dforce_dp @ inverse.T), 0.0))
+    stability = assess_stability(eq)
+    return {
+        "p_m": eq.p.tolist(),
+        "q_rad": eq.q.tolist(),
+        "mode": eq.mode,
+        "torque_Nm": np.abs(eq.motor_torque).tolist(),
+        "torque_limit_Nm": eq.robot.torque_limit,
+        "strain": [None if math.isnan(one) else one for one in eq.max_strain.tolist()],
+        "stiffness_N_m": stability.stiffness_eigenvalues.tolist(),
+        "rod_margins": [None if math.isnan(one) else one for one in stability.rod_margins.tolist()],
+        "motor_authority_N_rad": stability.motor_authority,
+        "natural_frequencies_Hz": (rates / (2 * math.pi)).tolist(),
+        "moving_mass_kg": np.linalg.eigvalsh(mass).tolist(),
+        "share_of_rods": share,
+    }
+
+
+def _modes(pose: Equilibrium) -> list[dict[str, Any]]:
+    """Which working modes hold the tip of a pose, each by a search of its own."""
+    rows = []
+    for letters in itertools.product("LR", repeat=pose.robot.n_rods):
+        interrupt.check()
+        mode = "".join(letters)
+        try:
+            eq = pose if mode == pose.mode else inverse_statics(pose.robot, pose.p, mode=mode)
+        except PCRError:
+            rows.append({"mode": mode, "possible": False})
+            continue
+        strain = float(np.nanmax(eq.max_strain)) if np.isfinite(eq.max_strain).any() else None
+        rows.append(
+            {
+                "mode": mode,
+                "possible": True,
+                "torque_Nm": float(np.abs(eq.motor_torque).max()),
+                "strain": strain,
+                "least_stiffness_N_m": float(eq.stiffness_eigenvalues[0]),
+                "energy_J": eq.energy,
+            }
+        )
+    return rows
+
+
+def _workspace(reach: Reach) -> dict[str, Any]:
+    cell = reach.spacing**2
+    tips = reach.tips
+    return {
+        "area_m2": cell * len(tips),
+        "within_rods_reach_m2": cell * reach.within,
+        "x_m": [float(tips[:, 0].min()), float(tips[:, 0].max())] if len(tips) else None,
+        "y_m": [float(tips[:, 1].min()), float(tips[:, 1].max())] if len(tips) else None,
+        "spacing_m": reach.spacing,
+        "ends": reach.ends,
+    }

@@ -1,0 +1,112 @@
+"""What somebody wants of a robot."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ..errors import ModelError, check_numbers
+from ..files import name_problem
+from ..plant.materials import MATERIALS, Material, Section
+from ..plant.robot import Robot
+from ..plant.rod import Rod
+from .layout import Layout
+from .motors import Motor
+
+_MOST_RODS = 4
+_SLENDER = 50.0  # length over diameter from which a rod is a beam that bends and does nothing else
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is known of a robot that is to be; None for what is to be chosen.
+
+    Attributes
+    ----------
+    name : str
+    rods : int
+        2 to 4.
+    material : str
+        A key of `MATERIALS`.
+    diameter, length : float
+        Of the rods [m].
+    spacing : float or None
+        Between neighbouring motors [m].
+    tip_mass : float or None
+        [kg].
+    motor : str or None
+        A key of `MOTORS`.
+    """
+
+    name: str
+    rods: int = 2
+    material: str = "nitinol"
+    diameter: float = 1e-3
+    length: float = 0.5
+    spacing: float | None = None
+    tip_mass: float | None = None
+    motor: str | None = None
+
+    def __post_init__(self) -> None:
+        if problem := name_problem(self.name):
+            raise ModelError(f"name: {problem}", key="name")
+        if not 2 <= self.rods <= _MOST_RODS:
+            raise ModelError(f"rods is {self.rods}, expected 2 to {_MOST_RODS}", key="rods")
+        given = [key for key in ("spacing", "tip_mass") if getattr(self, key) is not None]
+        check_numbers(self, {key: {"above": 0.0} for key in ("diameter", "length", *given)})
+        if self.material not in MATERIALS:
+            near = difflib.get_close_matches(self.material, MATERIALS, n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            known = ", ".join(MATERIALS)
+            raise ModelError(f"material {self.material!r} is not known; {hint}known are {known}", key="material")
+        if self.length < _SLENDER * self.diameter:
+            raise ModelError(
+                f"rods {length_text(self.length)} long and {length_text(self.diameter)} thick are no slender rods: "
+                f"they are to be at least {_SLENDER:g} diameters long, {length_text(_SLENDER * self.diameter)}. "
+                "Numbers are in metres",
+                key="length",
+            )
+
+    @property
+    def stuff(self) -> Material:
+        """What the rods are made of."""
+        return MATERIALS[self.material]
+
+    @property
+    def section(self) -> Section:
+        """Of the rods."""
+        return Section.round(self.diameter)
+
+    def robot(self, layout: Layout, motor: Motor, tip_mass: float = 1.0, drag: float = 0.0) -> Robot:
+        """Robot of these rods."""
+        material, section = self.stuff, self.section
+        rods = tuple(
+            Rod(
+                base=base,
+                length=self.length,
+                bending_stiffness=material.youngs_modulus * section.second_moment,
+                line_density=material.density * section.area,
+                angle_limits=stops,
+                half_thickness=section.half_thickness,
+                strain_limit=material.strain_limit,
+            )
+            for base, stops in zip(layout.bases, layout.angle_limits, strict=True)
+        )
+        limits = motor.rate_limit, motor.acceleration_limit, motor.torque_limit
+        return Robot(self.name, rods, tip_mass, drag, *limits)
+
+
+def rounded(value: float, *, up: bool = False, down: bool = False) -> float:
+    """Round to two digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    turn: Callable[[float], float] = (
+        (lambda x: math.ceil(x - 1e-9)) if up else (lambda x: math.floor(x + 1e-9)) if down else round
+    )
+    return float(f"{turn(value / unit) * unit:.6g}")
+
+
+def length_text(length: float) -> str:
+    """Write a length in mm or m."""
+    return f"{1e3 * length:.3g} mm" if length < 1.0 else f"{length:.3g} m"

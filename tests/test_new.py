@@ -1,0 +1,208 @@
+"""A robot from a few numbers: written, checked, tracked; refused where it cannot work, with numbers that can."""
+
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcr_mpc import InfeasibleError, ModelError, load_robot, load_scene, make_controller, simulate
+from pcr_mpc.cli import main
+from pcr_mpc.design.examination import examine
+from pcr_mpc.design.motors import MOTORS, motor_named
+from pcr_mpc.design.sizing import design
+from pcr_mpc.design.toml_text import files
+from pcr_mpc.design.wish import Wish
+from pcr_mpc.plant.materials import MATERIALS
+
+
+def tracked(folder, laps=0.35):
+    """Largest error of a written scene in its first laps, in rod lengths; with a verdict on the run."""
+    scene = load_scene(folder / "scene.toml")
+    duration = round(laps * scene.trajectory.period / scene.period) * scene.period
+    run = simulate(replace(scene, duration=duration), scene.make_plant(), make_controller(scene))
+    summary = run.summary()
+    assert summary["verdict"] == ""
+    assert summary["fallbacks"] == 0
+    return 1e-3 * summary["max_mm"] / scene.robot.lengths.max()
+
+
+def written(folder, **numbers):
+    chosen = design(Wish("mine", **numbers))
+    folder.mkdir(exist_ok=True)
+    for name, text in files(chosen).items():
+        (folder / name).write_text(text)
+    return chosen
+
+
+@pytest.fixture(scope="module")
+def mine(tmp_path_factory):
+    """The folder that `new` writes without an option."""
+    folder = tmp_path_factory.mktemp("own") / "mine"
+    assert main(["new", str(folder)]) == 0
+    return folder
+
+
+def test_it_tracks(mine):
+    assert tracked(mine) < 5e-5
+
+
+def test_stiffness_and_density_are_those_of_the_wire(mine):
+    """Nitinol of 1 mm: 75 GPa and 6450 kg/m^3, by hand."""
+    robot = load_robot(mine / "robot.toml")
+    assert robot.stiffnesses == pytest.approx([75e9 * math.pi * 0.001**4 / 64] * 2)
+    assert [rod.line_density for rod in robot.rods] == pytest.approx([6450 * math.pi * 0.0005**2] * 2)
+    assert robot.strain_limits == pytest.approx([MATERIALS["nitinol"].strain_limit] * 2)
+
+
+def test_strain_is_curvature_times_the_radius(mine):
+    """Curvature by differences along the wire; at the clamp it is tau / EI. `new` must stay within what it bears."""
+    scene = load_scene(mine / "scene.toml")
+    eq = scene.start()
+    steps = np.diff(eq.shape(2001), axis=1)
+    angles = np.unwrap(np.arctan2(steps[..., 1], steps[..., 0]))
+    curvature = np.abs(np.diff(angles)) / (0.5 / 2000)
+    assert eq.max_strain == pytest.approx(0.0005 * curvature.max(axis=1), rel=1e-3)
+    assert 0.0005 * curvature[:, 0] == pytest.approx(
+        0.0005 * np.abs(eq.motor_torque) / scene.robot.stiffnesses, rel=1e-2
+    )
+    assert eq.max_strain.max() < MATERIALS["nitinol"].strain_limit
+
+
+def test_every_number_has_its_unit_or_its_source(mine):
+    """A comment beside it, unless an earlier rod's same key has one; and the head says how to make it again."""
+    for name in ("robot", "scene", "tuning"):
+        explained = set()
+        for line in (mine / f"{name}.toml").read_text().splitlines():
+            if match := re.match(r"(\w+) = [\d\[-]", line):
+                assert "#" in line or match[1] in explained, f"{name}: {line}"
+                explained.add(match[1])
+    text = (mine / "robot.toml").read_text()
+    assert "#   pcr-mpc new mine --rods 2 --material nitinol --diameter 0.001 --length 0.5\n" in text
+    assert MATERIALS["nitinol"].source.split()[0] in text
+
+
+def test_nothing_is_overwritten(mine, capsys):
+    before = (mine / "scene.toml").read_bytes()
+    assert main(["new", str(mine), "--rods", "3"]) == 1
+    assert "robot.toml: is there already; give another folder, or --force" in capsys.readouterr().err
+    assert (mine / "scene.toml").read_bytes() == before
+
+
+def test_json_says_what_was_chosen(tmp_path, capsys):
+    given = ["--rods", "3", "--tip-mass", "0.05", "--motor", "xm430-w210"]
+    assert main(["new", str(tmp_path / "three"), *given, "--json"]) == 0
+    captured = capsys.readouterr()
+    record = json.loads(captured.out)
+    assert record["motor"] == "XM430-W210"
+    assert record["tip_mass_kg"] == 0.05
+    assert record["peaks"]["torque"]["used"] < 1
+    assert "next: pcr-mpc check" in captured.err
+    robot = load_robot(tmp_path / "three/robot.toml")
+    assert (robot.n_rods, robot.tip_mass, robot.torque_limit) == (3, 0.05, 1.5)
+
+
+def test_motors_by_name():
+    assert motor_named("xl330-m288") is MOTORS["XL330-M288"]
+    # 3 N m and 77 rev/min, as models/planar_pair.toml has them.
+    assert motor_named("XM430-W210").torque_limit == pytest.approx(1.5)
+    assert motor_named("XM430-W210").rate_limit == pytest.approx(0.75 * 77 * 2 * math.pi / 60)
+    with pytest.raises(ModelError, match=r"'XM430' is not known; did you mean XM430-W210\?"):
+        motor_named("XM430")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"rods": 5}, "rods is 5, expected 2 to 4"),
+        ({"material": "nitinl"}, r"'nitinl' is not known; did you mean nitinol\?"),
+        ({"diameter": 1.0}, "no slender rods: they are to be at least 50 diameters long, 50 m"),
+        ({"diameter": -1e-3}, "diameter: is -0.001"),
+        ({"tip_mass": math.nan}, "tip_mass: expected a number, found nan"),
+    ],
+)
+def test_numbers_of_another_kind_are_refused(numbers, message):
+    with pytest.raises(ModelError, match=message):
+        Wish("mine", **numbers)
+
+
+def suggested(message, key):
+    """Number after which the message names what it is of, in SI units."""
+    found = re.search(rf"nearest that works: .*?([\d.]+) (mm|m) {key}", message)
+    assert found, message
+    return float(found[1]) * (1e-3 if found[2] == "mm" else 1.0)
+
+
+@pytest.mark.slow
+def test_a_rod_too_stiff_for_the_motor_is_refused_and_the_nearest_works():
+    numbers = {"diameter": 3e-3, "length": 1.0, "motor": "XL330-M288"}
+    with pytest.raises(InfeasibleError, match=r"N m of a motor at rest, where XL330-M288 has 0\.26 N m") as caught:
+        design(Wish("mine", **numbers))
+    assert caught.value.limit == "torque"
+    message = str(caught.value)
+    assert "or a stronger motor, such as XC330-M288" in message
+    nearest = suggested(message, "diameter")
+    assert 1.5e-3 < nearest < 3e-3
+    assert design(Wish("mine", **{**numbers, "diameter": nearest})).motor.name == "XL330-M288"
+
+
+def test_a_rod_that_no_motor_turns_is_refused():
+    with pytest.raises(InfeasibleError, match=r"N m of a motor at rest, where XM540-W270 has 5.3 N m .* diameter"):
+        design(Wish("mine", material="cfrp", diameter=0.01, length=1.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", ["diameter", "length"])
+def test_a_rod_that_would_be_strained_beyond_its_limit_is_refused_and_the_nearest_works(key):
+    numbers = {"material": "spring_steel", "diameter": 1.7e-3, "length": 0.41}
+    with pytest.raises(InfeasibleError, match=r"strained to .* where spring_steel bears 0\.7 %") as caught:
+        design(Wish("mine", **numbers))
+    assert caught.value.limit == "strain"
+    nearest = suggested(str(caught.value), key)
+    assert 0.7 < nearest / numbers[key] < 1.4
+    design(Wish("mine", **{**numbers, key: nearest}))
+
+
+@pytest.mark.parametrize(
+    ("mass", "message"),
+    [
+        (100.0, r"swings on these rods once in \d+.* s, .* at most ([\d.]+) kg"),
+        (1e-3, r"is lighter than its rods, .* at least ([\d.e-]+) kg"),
+    ],
+)
+def test_a_tip_of_the_wrong_mass_is_refused_and_the_nearest_works(mass, message):
+    with pytest.raises(InfeasibleError, match=message) as caught:
+        design(Wish("mine", tip_mass=mass))
+    nearest = float(re.search(message, str(caught.value))[1])
+    assert design(Wish("mine", tip_mass=nearest)).tip_mass == nearest
+
+
+def test_motors_too_far_apart_are_refused(capsys, tmp_path):
+    assert main(["new", str(tmp_path / "wide"), "--spacing", "1.2"]) == 1
+    assert "motors 1.2 m apart cannot be joined" in capsys.readouterr().err
+    assert not list((tmp_path / "wide").glob("*.toml"))
+
+
+SPREAD = [
+    {"rods": 2, "material": "nitinol_linear", "diameter": 2.1e-4, "length": 0.15, "spacing": 0.15},
+    {"rods": 2, "material": "gfrp", "diameter": 4.3e-3, "length": 0.8},
+    {"rods": 2, "material": "spring_steel", "diameter": 1.0e-3, "length": 0.4},
+    {"rods": 2, "material": "nitinol", "diameter": 1.9e-3, "length": 1.6},
+    {"rods": 3, "material": "gfrp", "diameter": 8.4e-4, "length": 0.49, "spacing": 0.23},
+    {"rods": 3, "material": "nitinol", "diameter": 1e-3, "length": 0.5, "tip_mass": 1.0},
+    {"rods": 4, "material": "cfrp", "diameter": 2.3e-3, "length": 0.35},
+    {"rods": 4, "material": "titanium", "diameter": 3.7e-3, "length": 0.74},
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("numbers", SPREAD, ids=lambda one: "-".join(map(str, one.values())))
+def test_robots_of_all_sizes_check_and_track(numbers, tmp_path):
+    """From wires of 0.2 mm to rods of 4 mm, from 0.15 to 1.6 m."""
+    written(tmp_path, **numbers)
+    found = examine(load_scene(tmp_path / "scene.toml"), modes=False)
+    assert found.errors == []
+    assert max(row["used"] for row in found.figures["reference"]["peaks"].values()) < 1
+    assert tracked(tmp_path, laps=0.35) < 1e-4
