@@ -170,6 +170,8 @@ def checked_period(name: str, value: Any) -> int:
     ValueError
         Names the argument and its value.
     """
+    if type(value) is int and value >= 0:  # a tenth of the time of what follows
+        return value
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral) or value < 0:
         raise ValueError(f"{name} = {value!r} must be a whole number, counted from 0")
     return int(value)

@@ -191,7 +191,7 @@ class LinearMPC:
         hessian, gradient, _ = qp.sizes.tolist()
         if not self._continues(self.limits, hessian, gradient):
             self._forget()
-        warm = None if self._last is None or self._problem is None else _shifted(self._last.inputs).ravel()
+        warm = None if self._last is None or self._problem is None else _shifted(self._last.inputs).reshape(-1)
         self._problem = self.limits, hessian, gradient
         updated = time.perf_counter()
         status, fallback = "solved", None
@@ -239,12 +239,12 @@ class LinearMPC:
         if self._problem is None:
             return True
         before, last_hessian, last_gradient = self._problem
+        if not (limits is before and hessian <= _JUMP * last_hessian <= _JUMP**2 * hessian):
+            return False
+        if last_gradient <= _JUMP * gradient:
+            return True
         slight = _SLIGHT * hessian * (limits.rate if limits.rate < np.inf else 1.0 / time_unit(self._dt))
-        return (
-            limits is before
-            and hessian <= _JUMP * last_hessian <= _JUMP**2 * hessian
-            and last_gradient <= _JUMP * max(gradient, slight)
-        )
+        return gradient < slight and last_gradient <= _JUMP * slight  # not if it is NaN
 
     def fall_back(self, status: str, x: np.ndarray, reference: Reference, u_previous: np.ndarray) -> Plan:
         """Answer without a QP: because it was not solved, or because there is no model or no measurement.

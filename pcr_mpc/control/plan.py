@@ -61,7 +61,10 @@ class Plan(Frozen):
     def found(cls, **fields: Any) -> Plan:
         """A plan with all its fields given, in a third of the time: for the control step."""
         plan = object.__new__(cls)
-        plan.__setstate__(fields)
+        plan.__dict__.update(fields)
+        for name in ("inputs", "states"):
+            if (array := fields[name]) is not None:
+                array.flags.writeable = False
         return plan
 
     def spanning(self, horizon: int) -> Plan:

@@ -64,7 +64,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
             f"and (c dt/m)^2 is {damping * damping:.3g}, at most {STIFFEST:g}; shorten the period or keep away from "
             "taut rods"
         )
-    function = _buffered(plant.robot.n_rods)
+    function = _buffered(plant.robot.n_rods, plant.inertia == "none")
     function.inputs[0][:] = k
     function.inputs[1][:] = g
     function.inputs[2][:] = force - f_ext - plant.tip_weight
@@ -82,49 +82,37 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
 
 
 @per_thread(maxsize=32)
-def _buffered(n: int) -> BufferedFunction:
-    return BufferedFunction(discretisation(n))
+def _buffered(n: int, point: bool) -> BufferedFunction:
+    return BufferedFunction(discretisation(n, point=point))
 
 
 @graph_cache(maxsize=32)
-def discretisation(n: int) -> Any:
+def discretisation(n: int, *, point: bool = False) -> Any:
     """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q)) -> [A, c, B, E],
-    column by column in one vector."""
+    column by column in one vector.
+
+    ``point``: M is that of a point mass, M[0, 0] times the identity, and fixed. Then all is made of powers of K, in a
+    third of the operations.
+    """
     k, g, force = ca.SX.sym("K", 2, 2), ca.SX.sym("G", 2, n), ca.SX.sym("F", 2)
     x, parameters = ca.SX.sym("x", 4 + n), ca.SX.sym("parameters", 2)
     mass, slopes = ca.SX.sym("M", 2 + n, 2 + n), ca.SX.sym("dM", (2 + n) ** 2, 2 + n)
     drag, dt = ca.vertsplit(parameters)
     p, v, q = x[:2], x[2:4], x[4:]
 
-    inverse = ca.inv(mass[:2, :2])
-    coupling = inverse @ mass[:2, 2:]
-    acceleration = -inverse @ (force + drag * v)
-    by_pose = ca.horzcat(*(ca.reshape(slopes[:, j], 2 + n, 2 + n)[:2, :2] @ acceleration for j in range(2 + n)))
-    k_effective, g_effective = k + by_pose[:, :2], g + by_pose[:, 2:]
+    inverse, coupling, k_effective, g_effective = ca.SX.eye(2) / mass[0, 0], ca.SX(2, n), k, g
+    if not point:
+        inverse = ca.inv(mass[:2, :2])
+        coupling = inverse @ mass[:2, 2:]
+        acceleration = -inverse @ (force + drag * v)
+        by_pose = ca.horzcat(*(ca.reshape(slopes[:, j], 2 + n, 2 + n)[:2, :2] @ acceleration for j in range(2 + n)))
+        k_effective, g_effective = k + by_pose[:, :2], g + by_pose[:, 2:]
 
     # In y = [dp, dv dt] and tau = t/dt the motion is dy/dtau = a y + [0, w0 + w1 tau], where the force at the
     # start gives w0 and the motors' rates w1; every entry is dimensionless. With phi_1 = int exp(a s) ds and
     # phi_2 = int (1 - s) exp(a s) ds over [0, 1], y(1) = exp(a) y(0) + phi_1 [0, w0] + phi_2 [0, w1].
     scale = dt * dt * inverse
-    a = ca.SX(4, 4)
-    a[0:2, 2:4] = ca.SX.eye(2)
-    a[2:4, 0:2] = -scale @ k_effective
-    a[2:4, 2:4] = -dt * drag * inverse
-
-    # Taylor series over a fraction of the period, then doubled; of phi_1, phi_2 only the force's columns.
-    fraction = 1.0 / 2**_SQUARINGS
-    power = ca.SX.eye(4)
-    exponential, phi_1, phi_2 = power, fraction * power[:, 2:], fraction**2 / 2 * power[:, 2:]
-    for order in range(1, _TAYLOR_ORDER + 1):
-        power = (fraction / order) * ca.mtimes(a, power)
-        exponential += power
-        phi_1 += fraction / (order + 1) * power[:, 2:]
-        phi_2 += fraction**2 / ((order + 1) * (order + 2)) * power[:, 2:]
-    for _ in range(_SQUARINGS):
-        phi_2 = ca.mtimes(exponential, phi_2) + fraction * phi_1 + phi_2
-        phi_1 = ca.mtimes(exponential, phi_1) + phi_1
-        exponential = ca.mtimes(exponential, exponential)
-        fraction *= 2
+    exponential, phi_1, phi_2 = (_of_point if point else _of_mass)(scale @ k_effective, dt * drag * inverse)
 
     units = ca.vertcat(1, 1, 1 / dt, 1 / dt)
     by_angle = -phi_1 @ scale @ g_effective
@@ -142,3 +130,69 @@ def discretisation(n: int) -> Any:
     results = [ca.vertcat(ca.vec(a_matrix), c_vector, ca.vec(b_matrix), ca.vec(e_matrix))]
     arguments = [k, g, force, x, parameters, mass, slopes]
     return ca.Function("discretise", arguments, results, {"cse": True})
+
+
+def _of_mass(stiffness: Any, damping: Any) -> tuple[Any, Any, Any]:
+    """exp(a), and of phi_1 and phi_2 the force's columns, for a = [[0, I], [-stiffness, -damping]]."""
+    a = ca.vertcat(ca.horzcat(ca.SX(2, 2), ca.SX.eye(2)), ca.horzcat(-stiffness, -damping))
+    # Taylor series over a fraction of the period, then doubled.
+    fraction = 1.0 / 2**_SQUARINGS
+    power = ca.SX.eye(4)
+    exponential, phi_1, phi_2 = power, fraction * power[:, 2:], fraction**2 / 2 * power[:, 2:]
+    for order in range(1, _TAYLOR_ORDER + 1):
+        power = (fraction / order) * ca.mtimes(a, power)
+        exponential += power
+        phi_1 += fraction / (order + 1) * power[:, 2:]
+        phi_2 += fraction**2 / ((order + 1) * (order + 2)) * power[:, 2:]
+    for _ in range(_SQUARINGS):
+        phi_2 = ca.mtimes(exponential, phi_2) + fraction * phi_1 + phi_2
+        phi_1 = ca.mtimes(exponential, phi_1) + phi_1
+        exponential = ca.mtimes(exponential, exponential)
+        fraction *= 2
+    return exponential, phi_1, phi_2
+
+
+def _of_point(stiffness: Any, damping: Any) -> tuple[Any, Any, Any]:
+    """`_of_mass` where the damping is a multiple d of the identity.
+
+    Then exp(a tau) = [[A, B], [-S B, A - d B]] with A = I - S int B, and all blocks are x I + y S, for by
+    Cayley and Hamilton S^2 = trace S - det I: two numbers each.
+    """
+    s, d = stiffness, damping[0, 0]
+    trace, determinant = s[0, 0] + s[1, 1], s[0, 0] * s[1, 1] - s[0, 1] * s[1, 0]
+
+    def times(one: Any, other: Any) -> Any:
+        square = one[1] * other[1]
+        return ca.vertcat(
+            one[0] * other[0] - determinant * square, one[0] * other[1] + one[1] * other[0] + trace * square
+        )
+
+    def by_s(one: Any) -> Any:
+        return ca.vertcat(-determinant * one[1], one[0] + trace * one[1])
+
+    # The columns of a^k [0, I] are [t, b], and their series B, its integral and the integral of that.
+    fraction = 1.0 / 2**_SQUARINGS
+    t, b = ca.SX(2, 1), ca.SX([1, 0])
+    block, once, twice, factor = ca.SX(2, 1), ca.SX(2, 1), ca.SX(2, 1), 1.0
+    for order in range(1, _TAYLOR_ORDER + 1):
+        t, b = b, -by_s(t) - d * b
+        factor *= fraction / order
+        block += factor * t
+        once += factor * fraction / (order + 1) * t
+        twice += factor * fraction**2 / ((order + 1) * (order + 2)) * t
+    for _ in range(_SQUARINGS):
+        a = ca.SX([1, 0]) - by_s(once)
+        twice = twice + fraction * once + times(a, twice) + times(block, once)
+        once = once + times(a, once) + times(block, block)
+        block = times(block, 2 * a - d * block)
+        fraction *= 2
+    a = ca.SX([1, 0]) - by_s(once)
+
+    def matrix(one: Any) -> Any:
+        return one[0] * ca.SX.eye(2) + one[1] * s
+
+    moves = matrix(block)
+    exponential = ca.vertcat(
+        ca.horzcat(matrix(a), moves), ca.horzcat(-matrix(by_s(block)), matrix(a - d * block))
+    )  # fmt: skip
+    return exponential, ca.vertcat(matrix(once), moves), ca.vertcat(matrix(twice), matrix(once))

@@ -96,7 +96,7 @@ def model_graph(model: StepModel, iterations: int) -> Any:
     if model.inertia != "none":
         mass = mass + ca.diag(ca.vertcat(payload, payload, ca.DM.zeros(n)))
     push = force - f_ext - tip * numbers.gravity
-    packed = discretisation(n)(k, g, push, x, ca.vertcat(numbers.drag, dt), mass, slopes)
+    packed = discretisation(n, point=model.inertia == "none")(k, g, push, x, ca.vertcat(numbers.drag, dt), mass, slopes)
     stiffness, damping = ca.norm_inf(ca.vec(k)) * dt**2 / numbers.tip_mass, numbers.drag * dt / numbers.tip_mass
     return ca.Function(
         "model", [x, f_ext, payload, memory, vector, constant, dt],

@@ -131,16 +131,19 @@ class LimitWatch(Remade):
         `elastica`); NaN is not far.
         """
         limits, n = self.limits, (len(signs) - 1) // 3
-        if limits.tip_lower is not None or not self._strain.far(signs[1 + 2 * n :]):
+        if limits.tip_lower is not None or (self._strain.count and not self._strain.far(signs[1 + 2 * n :])):
             return False
-        if limits.torque is not None and not max(map(abs, signs[1 : 1 + n])) < _TORQUE_WATCHED * limits.torque:
-            return False
+        if limits.torque is not None:
+            watched = _TORQUE_WATCHED * limits.torque
+            for torque in signs[1 : 1 + n]:
+                if not -watched < torque < watched:
+                    return False
         if limits.stiffness is not None and not signs[0] > _STIFFNESS_WATCHED * limits.stiffness:
             return False
         if limits.rod_margin is None:
             return True
         near = (1.0 - limits.rod_margin - _MARGIN_WATCHED) * LEAST_CRITICAL_LOAD
-        return all(load <= near for load in signs[1 + 2 * n :])
+        return max(signs[1 + 2 * n :]) <= near
 
     def recall(self, record: np.ndarray) -> None:
         """Tell the plant where its rods are (see `Plant.recall`)."""

@@ -184,7 +184,10 @@ class Gate:
         turn = self._turn + _ANGLE_ECHO * self._encoders.surprise
         jumps = list(map(sub, q, self._before))
         # So written that NaN is odd.
-        if all(abs(jump) <= turn for jump in jumps):
+        for jump in jumps:
+            if not -turn <= jump <= turn:
+                break
+        else:
             return None
         text = f"motor angles {_listed(q)} rad"
         if not all(map(math.isfinite, q)):
