@@ -1,7 +1,7 @@
 """The default robot's tip let go in PyElastica, another code for rods; `mujoco_agreement` compares it.
 
 PyElastica's rods stretch and shear, explicitly in time, so they get a thick section of soft, light matter with the
-wire's bending stiffness and mass per length; the thinner, the stiffer and the slower. The clamp holds the middle of the
+rods' bending stiffness and mass per length; the thinner, the stiffer and the slower. The clamp holds the middle of the
 first element, so that is where the rod begins. The tip's mass and drag sit on the last nodes, shared by the rods, with
 a stiff spring between them.
 """

@@ -2,15 +2,16 @@
 
 import math
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pcr_mpc import MATERIALS, Material, ModelError, Rod, Section, load_robot
+from pcr_mpc import MATERIALS, Material, ModelError, Rod, Section, inverse_statics, load_robot
 from pcr_mpc.loop.record import from_text, to_text
 
-from .conftest import MODELS
+from .conftest import MODELS, ROOT
 
 WHERE = {"base": (0.0, 0.0), "length": 0.4, "angle_limits": (-1.0, 1.0)}
 
@@ -223,3 +224,56 @@ def test_there_and_back(robot_file):
     assert from_text(to_text(robot)).rods == robot.rods
     old = to_text(load_robot(MODELS / "rfrfr.toml").rods[0])
     assert from_text(old).half_thickness is None
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+PAGE = (ROOT / "docs" / "robots.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_the_page_lists_the_materials():
+    rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \| (.*) \|$", PAGE, re.MULTILINE)
+    assert [row[0] for row in rows] == list(MATERIALS)
+    for row, material in zip(rows, MATERIALS.values(), strict=True):
+        expected = (material.youngs_modulus / 1e9, material.density, 100 * material.strain_limit)
+        assert list(map(float, row[1:4])) == pytest.approx(expected)
+        assert row[4] == material.source
+
+
+def test_the_robot_of_the_page_can_be_built(tmp_path):
+    (text,) = blocks("toml")
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    eq = inverse_statics(load_robot(path), (0.0, 0.3), mode="LR")
+    assert eq.stable
+    assert eq.overstrained == ()
+    assert np.abs(eq.motor_torque).max() < eq.robot.torque_limit
+
+
+def test_the_python_of_the_page_runs(capsys):
+    (code,) = blocks("python")
+    exec(code, {})
+    assert list(map(float, capsys.readouterr().out.split())) == pytest.approx([0.05, 0.014058, 0.0085], rel=1e-5)
+
+
+def test_the_page_compares_what_would_do():
+    """Thickness, strain at the sharpest bend of the scenes and line density of each rod of EI = 0.05 N m^2."""
+    number = r"([\d.]+)"
+    pattern = rf"^\| (.*?) \| {number} mm \| {number} % \| {number} %.*? \| {number} kg/m \|$"
+    rows = re.findall(pattern, PAGE, re.MULTILINE)
+    names = ("spring_steel", "nitinol", "nitinol_linear", "gfrp", "spring_steel", "cfrp")
+    for name, (words, thickness, strain, limit, density) in zip(names, rows, strict=True):
+        material, across = MATERIALS[name], 1e-3 * float(thickness)
+        section = Section.round(across)
+        if "strip" in words:
+            width = 12 * 0.05 / (material.youngs_modulus * across**3)
+            section = Section.strip(width, across)
+            assert f"{1e3 * width:.3g} mm wide" in words
+        assert material.youngs_modulus * section.second_moment == pytest.approx(0.05, rel=0.01)
+        assert float(density) == pytest.approx(material.density * section.area, rel=0.01)
+        assert float(strain) == pytest.approx(100 * across / 2 / 0.0513, abs=0.01)
+        assert float(limit) == pytest.approx(100 * material.strain_limit)

@@ -220,7 +220,7 @@ def test_pose_limits_in_a_scene(tmp_path):
     text = text.replace('"../planar_pair', f'"{MODELS.as_posix()}/planar_pair')
     path = tmp_path / "scene.toml"
     path.write_text(text + "\n[limits]\ntorque = 1.0\nrod_margin = 0.2\nstiffness = 0\n")
-    assert load_scene(path).pose_limits == PoseLimits(torque=1.0, rod_margin=0.2)
+    assert load_scene(path).pose_limits == PoseLimits(torque=1.0, rod_margin=0.2, strain=(0.0085, 0.0085))
     path.write_text(text + "\n[limits]\ntip_lower = [0.0, 0.0]\n")
     with pytest.raises(ModelError, match="both tip_lower and tip_upper"):
         load_scene(path)

