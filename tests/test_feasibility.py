@@ -91,7 +91,7 @@ def test_nothing_is_said_of_what_can_be_had(slow):
     run = simulate(replace(slow, duration=0.2), slow.make_plant(), make_controller(replace(slow, duration=0.2)))
     assert run.events == []
     assert run.summary()["warnings"] == 0
-    assert run.pose_violations() == {"torque": 0, "rod margin": 0, "stiffness": 0}
+    assert run.pose_violations() == {"torque": 0, "rod margin": 0, "stiffness": 0, "strain": 0}
 
 
 def test_rates(slow, path):
@@ -182,7 +182,7 @@ def test_broken_limits_on_poses_are_counted(pair):
     poses = replace(scene.pose_limits, torque=0.8, tip_lower=(-0.01, 0.2), tip_upper=(0.01, 0.3), stiffness=62.0)
     scene = replace(scene, pose_limits=poses)
     run = simulate(scene, scene.make_plant(), HoldMotors(2))
-    count, guess = {"torque": 0, "tip region": 0, "stiffness": 0}, run.pose
+    count, guess = {"torque": 0, "tip region": 0, "stiffness": 0, "strain": 0}, run.pose
     for x in run.x[:: run.steps_per_period]:
         guess = solve_statics(pair, x[:2], x[4:], method="multiple_shooting", guess=guess)
         count["torque"] += np.abs(guess.motor_torque).max() > 0.8
