@@ -182,7 +182,7 @@ def test_broken_limits_on_poses_are_counted(pair):
     poses = replace(scene.pose_limits, torque=0.8, tip_lower=(-0.01, 0.2), tip_upper=(0.01, 0.3), stiffness=62.0)
     scene = replace(scene, pose_limits=poses)
     run = simulate(scene, scene.make_plant(), HoldMotors(2))
-    count, guess = {"torque": 0, "tip region": 0, "stiffness": 0, "strain": 0}, run.pose
+    count, guess = {"torque": 0, "tip region": 0, "stiffness": 0}, run.pose
     for x in run.x[:: run.steps_per_period]:
         guess = solve_statics(pair, x[:2], x[4:], method="multiple_shooting", guess=guess)
         count["torque"] += np.abs(guess.motor_torque).max() > 0.8
