@@ -2,9 +2,10 @@
 
 Works on a copy of the tree. The default tests run there once, under coverage, for which of them touch which file and
 how long they take. Then each mutant (one change of an operator, a number, a condition) meets the tests that touch its
-file, those that touch its lines first, up to the first that fails. Every place in the code that could be changed is as
-likely as any other to be drawn. Survivors are printed with their diffs, and written to survivors.diff beside
-mutants.sqlite, which Cosmic Ray's own reports read (``cr-report``, ``cr-html``).
+file, those that touch its lines first, up to the first that fails; a minute of them at first, and the rest when every
+mutant has had its minute. Every place in the code that could be changed is as likely as any other to be drawn.
+Survivors are printed with their diffs, and written to survivors.diff beside mutants.sqlite, which Cosmic Ray's own
+reports read (``cr-report``, ``cr-html``).
 
 Run as ``make mutants`` or ``python -m experiments.mutants --count 20 --tests tests/test_mpc.py``; 200 take some hours.
 ``--resume`` goes on where an earlier run into the same folder was stopped, and raises its number if asked for more.
@@ -25,12 +26,13 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import accumulate
 from pathlib import Path
 
 from cosmic_ray.commands.init import init
 from cosmic_ray.mutating import mutate_and_test
 from cosmic_ray.work_db import WorkDB, use_db
-from cosmic_ray.work_item import MutationSpec, TestOutcome, WorkItem, WorkResult
+from cosmic_ray.work_item import MutationSpec, TestOutcome, WorkerOutcome, WorkItem, WorkResult
 from coverage import CoverageData
 from scipy.stats import binomtest
 
@@ -41,6 +43,7 @@ PYTEST = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
 # which a busy machine does not lengthen; one that sleeps for ever is ended by the clock.
 LEAST_TIMEOUT, TIMEOUT_FACTOR = 60.0, 5.0  # s, of the time that the tests took
 CLOCK_FACTOR = 10.0
+QUICK = 60.0  # s of tests that every mutant meets before any of them meets more
 
 
 Touched = dict[int, set[str]]  # tests by the lines of a file; all that touch the file under 0
@@ -133,22 +136,37 @@ def ordered(change: MutationSpec, touched: Touched, seconds: dict[str, float]) -
     return sorted(touched.get(0, set()), key=rank)
 
 
+def divided(tests: list[str], seconds: dict[str, float]) -> tuple[list[str], list[str]]:
+    """The first tests, as many as take a minute, and the others."""
+    spent = accumulate(seconds[name] for name in tests)
+    quick = max(1, sum(until <= QUICK for until in spent))
+    return tests[:quick], tests[quick:]
+
+
 def enter(trees: multiprocessing.Queue[Path]) -> None:
     """Give a worker its own tree."""
     os.chdir(trees.get())
     os.environ["PYTHONPATH"] = os.getcwd()
 
 
-def judge(change: MutationSpec, tests: list[str], limit: float) -> WorkResult:
+def judge(change: MutationSpec, tests: list[str], seconds: float) -> WorkResult:
     """Change the worker's tree and run the tests there, up to the first that fails."""
+    limit = LEAST_TIMEOUT + TIMEOUT_FACTOR * seconds
     # Where no test touches the file, pytest has nothing to do, and that is no death.
     command = [*PYTEST, "-x", *tests] if tests else [sys.executable, "-c", ""]
     bounded = ["sh", "-c", 'ulimit -t "$0" && exec "$@"', f"{limit:.0f}", *command]
     return mutate_and_test([change], shlex.join(bounded), CLOCK_FACTOR * limit)
 
 
+def doubtful(result: WorkResult) -> bool:
+    """Whether a mutant has met its first tests only, and survived them."""
+    return result.worker_outcome is WorkerOutcome.SKIPPED
+
+
 def outcome(result: WorkResult) -> str:
     """How a mutant ended, in a word."""
+    if doubtful(result):
+        return "lives yet"
     if result.test_outcome is None:
         return "not made"
     # A process that ran into a limit says nothing at its end.
@@ -157,7 +175,7 @@ def outcome(result: WorkResult) -> str:
 
 
 def judged(
-    items: list[WorkItem], tests: dict[str, list[str]], limits: dict[str, float], trees: list[Path]
+    items: list[WorkItem], tests: dict[str, list[str]], seconds: dict[str, float], trees: list[Path]
 ) -> Iterator[tuple[WorkItem, WorkResult]]:
     """Results as they come."""
     context = multiprocessing.get_context("spawn")
@@ -165,9 +183,10 @@ def judged(
     for tree in trees:
         queue.put(tree)
     with ProcessPoolExecutor(len(trees), mp_context=context, initializer=enter, initargs=(queue,)) as pool:
-        submitted = {
-            pool.submit(judge, item.mutations[0], tests[item.job_id], limits[item.job_id]): item for item in items
-        }
+        submitted = {}
+        for item in items:
+            mine = tests[item.job_id]
+            submitted[pool.submit(judge, item.mutations[0], mine, sum(seconds[name] for name in mine))] = item
         for future in as_completed(submitted):
             yield submitted[future], future.result()
 
@@ -210,23 +229,29 @@ def main() -> None:
             init(sorted(path for name in PACKAGES for path in Path("pcr_mpc", name).rglob("*.py")), database, {})
         chosen = sample(database, arguments.count, arguments.seed)
         results = dict(database.results)
-        tests, limits = {}, {}
+        quick, rest = {}, {}
         for item in chosen:
             change = item.mutations[0]
-            tests[item.job_id] = ordered(change, touched[change.module_path.as_posix()], seconds)
-            limits[item.job_id] = LEAST_TIMEOUT + TIMEOUT_FACTOR * sum(seconds[name] for name in tests[item.job_id])
-        left = [item for item in chosen if item.job_id not in results]
+            tests = ordered(change, touched[change.module_path.as_posix()], seconds)
+            quick[item.job_id], rest[item.job_id] = divided(tests, seconds)
         trees = [out / f"tree-{number}" for number in range(arguments.jobs)]
         for copy in trees:  # anew: a run that was killed leaves a mutant in them
             shutil.rmtree(copy, ignore_errors=True)
             shutil.copytree(tree, copy)
-        for item, result in judged(left, tests, limits, trees):
-            database.set_result(item.job_id, result)
-            results[item.job_id] = result
-            change = item.mutations[0]
-            place = f"{chosen.index(item) + 1:4d} {outcome(result):9s} {change.module_path}:{change.start_pos[0]}"
-            operator = change.operator_name.removeprefix("core/")
-            print(place, operator, f"({len(tests[item.job_id])} tests)", flush=True)
+        for tests in (quick, rest):
+            first = tests is quick
+            left = [
+                item for item in chosen if (item.job_id not in results if first else doubtful(results[item.job_id]))
+            ]
+            for item, result in judged(left, tests, seconds, trees):
+                if first and result.test_outcome is TestOutcome.SURVIVED and rest[item.job_id]:
+                    result.worker_outcome = WorkerOutcome.SKIPPED
+                database.set_result(item.job_id, result)
+                results[item.job_id] = result
+                change = item.mutations[0]
+                place = f"{chosen.index(item) + 1:4d} {outcome(result):9s} {change.module_path}:{change.start_pos[0]}"
+                operator = change.operator_name.removeprefix("core/")
+                print(place, operator, f"({len(tests[item.job_id])} tests)", flush=True)
     report(chosen, results, out)
 
 
