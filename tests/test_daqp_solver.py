@@ -236,6 +236,24 @@ def test_iterations_are_capped_and_counted():
         assert solver.solve().iterations <= 2
 
 
+def test_each_way_to_fail_has_its_name():
+    for flag, status in ((-2, "cycling"), (-4, "maximum iterations"), (4, "solved inaccurate"), (-7, "DAQP's exit -7")):
+        qp = DAQPSolver(sp.identity(2, format="csc"), 1e-8, 100)
+        qp.update(np.array([1.0, 0.0, 1.0]), np.ones(2), -np.ones(2), np.ones(2))
+
+        class Failing:
+            def solve(self, flag=flag):
+                return np.zeros(2), 0.0, flag, {"iterations": 3, "lam": np.zeros(2)}
+
+            def update(self, **_):
+                return 0
+
+        qp._model = Failing()
+        with pytest.raises(InfeasibleError, match=status) as caught:
+            qp.solve()
+        assert (caught.value.iterations, caught.value.limit) == (3, None)
+
+
 def test_small_violations_count():
     """DAQP leaves rows out that are violated by less than 1e-6, whatever tolerance is asked for."""
     solver = DAQPSolver(sp.identity(2, format="csc"), tolerance=1e-7)

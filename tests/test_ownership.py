@@ -1,12 +1,15 @@
 """What is public takes effect or cannot be set; copies and pickles are whole, and start afresh."""
 
 import copy
+import importlib
 import pickle
-from dataclasses import replace
+import pkgutil
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
 
+import pcr_mpc
 from pcr_mpc import Plant, linearise
 from pcr_mpc.errors import ReadOnlyError
 
@@ -122,3 +125,16 @@ def test_a_frozen_value_made_by_replace_is_read_only(centre):
     other = replace(centre, force=np.zeros(2))
     with pytest.raises(ValueError, match="read-only"):
         other.force[0] = 1.0
+
+
+def test_values_that_hold_arrays_are_equal_to_themselves_alone():
+    """Arrays have no one answer to ``==``; a class that compared them would raise where it is compared."""
+    found = []
+    for module in pkgutil.walk_packages(pcr_mpc.__path__, "pcr_mpc."):
+        for made in vars(importlib.import_module(module.name)).values():
+            if isinstance(made, type) and is_dataclass(made) and made.__module__ == module.name:
+                holds = any("ndarray" in str(field.type) for field in fields(made))
+                assert not holds or made.__eq__ is object.__eq__, made
+                found.append(holds)
+    assert sum(found) > 15
+    assert not all(found)

@@ -11,6 +11,7 @@ from pcr_mpc.loop.controllers import Decision, Replay
 from pcr_mpc.plant.statics.solver import Snap
 
 from .conftest import MODELS
+from .test_stopwatch import Clock
 
 PERIODS, PER, DT = 6, 10, 1e-3  # 10 ms of control
 
@@ -54,6 +55,28 @@ def motor_rates(run):
 
 
 # --- time -------------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_decision_and_a_step_take_is_measured(scene, monkeypatch):
+    clock = Clock()
+
+    class Thinking(HoldMotors):
+        def step(self, k, x):
+            clock.pass_by(3e-3 + 1e-3 * k, 2e-3)
+            return super().step(k, x)
+
+    class Heavy(Around):
+        def step(self, *arguments):
+            clock.pass_by(5e-5, 0.0)
+            return self._plant.step(*arguments)
+
+    monkeypatch.setattr("pcr_mpc.loop.simulate.time", clock)
+    clock.pass_by(1234.5, 67.8)
+    run = simulate(scene, Heavy(scene.make_plant()), Thinking(2))
+    assert run.control_time[:, 0] == pytest.approx(3e-3 + 1e-3 * np.arange(PERIODS))
+    assert run.control_time[:, 5] == pytest.approx(np.full(PERIODS, 2e-3))
+    assert run.plant_time == pytest.approx(np.full(PERIODS * PER, 5e-5))
+    assert run.decision_time == pytest.approx(run.control_time[:, 0])
 
 
 @pytest.mark.parametrize(("cost", "steps"), [(0.9e-3, 0), (1.1e-3, 2), (3.2e-3, 4), (9.9e-3, 10)])

@@ -10,11 +10,12 @@ from pcr_mpc import load_scene
 from pcr_mpc.errors import ModelError
 from pcr_mpc.loop.settings import PlantSettings
 from pcr_mpc.study import choice as choosing
-from pcr_mpc.study import episodes
+from pcr_mpc.study import episodes, tuning_score
 from pcr_mpc.study.choice import Bench, Choice, Measured
 from pcr_mpc.study.chosen_rung import write_rung
-from pcr_mpc.study.episodes import EXACT, Mismatch, run_episode
+from pcr_mpc.study.episodes import EXACT, Mismatch, Spread, run_episode
 from pcr_mpc.study.estimates import Estimate, Estimates
+from pcr_mpc.study.provenance import differences
 from pcr_mpc.study.rungs import all_physics, ladders
 from pcr_mpc.study.tuning_score import Costs
 
@@ -33,6 +34,30 @@ def lemniscate():
 @pytest.fixture(scope="module")
 def release():
     return replace(load_scene(SCENES / "release.toml"), duration=0.05)
+
+
+def test_records_of_other_settings_are_told_by_their_place():
+    assert differences({"a": [1, {"b": 2.0}], "c": 0}, {"a": [1, {"b": 3.0}], "d": 0}) == [
+        "a[1].b was 2.0, is 3.0", "c was 0, is None", "d was None, is 0"]  # fmt: skip
+    for old, new in (([1, 2], [1]), ([1], [1, 2]), ([1], 1), ({"b": 1}, [1])):
+        assert differences({"a": old}, {"a": new}) == [f"a was {old}, is {new}"]
+    assert differences({"a": [1, (2,)]}, {"a": [1, (2,)]}) == []
+
+
+def test_tunings_are_compared_on_the_same_episodes(lemniscate, monkeypatch):
+    """Without mismatch both by seed 0, with it by the seeds that are given."""
+    start, seen = lemniscate.tuning, []
+
+    def noted(scene, tuning, seed, spread):
+        seen.append((tuning.name, seed, spread))
+        timing = {"control_cpu_us": 100.0, "late": 0.0}
+        return {"rms_mm": 1.0 + seed, "effort_rad_s2": 2.0, "failure": "", "timing": timing}
+
+    monkeypatch.setattr(tuning_score, "run_episode", noted)
+    costs = tuning_score.measure(lemniscate, start, replace(start, name="other", input_weight=1.0), [4, 5], Spread())
+    assert seen == [(start.name, 0, EXACT), ("other", 0, EXACT), ("other", 4, Spread()), ("other", 5, Spread())]
+    assert (costs.nominal_mm, costs.failure_rate) == (1.0, 0.0)
+    assert 5.0 <= costs.tracking_mm <= 6.0
 
 
 # --- the choice of a rung ---------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import gc
 import numpy as np
 import pytest
 
-from pcr_mpc.study import stopwatch
+from pcr_mpc.study import overhead, stopwatch
 from pcr_mpc.study.stopwatch import WARM_UP, Times, measure
 
 
@@ -99,3 +99,37 @@ def test_the_collector_is_on_and_off_in_turns_and_as_it_was_afterwards():
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_overhead_is_of_the_fastest_and_of_the_same_step(monkeypatch, pair, centre):
+    clock, graphs, rolled = Clock(), [], []
+    costs = iter([3.0, 2.0, 5.0])
+
+    class Seen(overhead.BufferedFunction):
+        def __init__(self, function):
+            super().__init__(function)
+            graphs.append(self)
+
+        def __call__(self):
+            clock.pass_by(9.0, 7.0)
+            return super().__call__()
+
+    def roll(plant, x, inputs, guess):
+        rolled.append((x, inputs.shape))
+        clock.pass_by(1.0, next(costs))
+
+    monkeypatch.setattr(overhead, "BufferedFunction", Seen)
+    monkeypatch.setattr(overhead, "rollout", roll)
+    monkeypatch.setattr(overhead, "time", clock)
+    for name, value in (("_BATCHES", 2), ("_CALLS", 2), ("_ROLLED", 1000), ("_ROLLOUTS", 3)):
+        monkeypatch.setattr(overhead, name, value)
+    rows = {row["name"]: row for row in overhead.call_overhead(pair, centre)}
+    assert {row["code"] for row in rows.values()} == {"interpreted"}
+    assert rows["graph"]["us"] == pytest.approx(7e6)
+    assert rows["plain call"]["us"] == rows["Plant.step"]["us"] == 0.0  # there this clock stands
+    assert rows["rollout"]["us"] == pytest.approx(1e6 * 2.0 / 1000)
+    (graph,) = graphs
+    start = [*centre.p, 0.05, -0.05, *centre.q]
+    assert graph.inputs[1] == pytest.approx(start)
+    assert np.any(graph.inputs[0])  # the rods' memory
+    assert [(pytest.approx(start), (1000, 2))] * 3 == [(x.tolist(), shape) for x, shape in rolled]
