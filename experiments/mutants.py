@@ -187,8 +187,11 @@ def judged(
         for item in items:
             mine = tests[item.job_id]
             submitted[pool.submit(judge, item.mutations[0], mine, sum(seconds[name] for name in mine))] = item
-        for future in as_completed(submitted):
-            yield submitted[future], future.result()
+        try:
+            for future in as_completed(submitted):
+                yield submitted[future], future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def report(chosen: list[WorkItem], results: dict[str, WorkResult], out: Path) -> None:
@@ -245,7 +248,7 @@ def main() -> None:
             ]
             for item, result in judged(left, tests, seconds, trees):
                 if first and result.test_outcome is TestOutcome.SURVIVED and rest[item.job_id]:
-                    result.worker_outcome = WorkerOutcome.SKIPPED
+                    result = WorkResult(WorkerOutcome.SKIPPED, result.output, result.test_outcome, result.diff)
                 database.set_result(item.job_id, result)
                 results[item.job_id] = result
                 change = item.mutations[0]

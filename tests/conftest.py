@@ -35,6 +35,20 @@ def compiler(monkeypatch, machine_code) -> str:
     return COMPILER
 
 
+@pytest.fixture
+def quick_storage():
+    """Studies of this process wait for no disk: what a test stores need not outlive the machine."""
+    event, engine = pytest.importorskip("sqlalchemy").event, pytest.importorskip("sqlalchemy.engine").Engine
+
+    def unsafe(connection, _):
+        connection.execute("PRAGMA synchronous = OFF")
+        connection.execute("PRAGMA journal_mode = MEMORY")
+
+    event.listen(engine, "connect", unsafe)
+    yield
+    event.remove(engine, "connect", unsafe)
+
+
 @pytest.fixture(scope="session")
 def pair() -> Robot:
     return load_robot(MODELS / "planar_pair.toml")

@@ -70,7 +70,7 @@ def test_statics_three_ways(capsys, tmp_path):
 
 def test_timing(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pcr_mpc.study.stopwatch._INTERRUPTED", math.inf)  # however busy the machine is
-    assert main(["timing", str(scene), "--steps", "100", "--json", "--out", str(tmp_path / "t")]) == 0
+    assert main(["timing", str(scene), "--steps", "60", "--json", "--out", str(tmp_path / "t")]) == 0
     result = json.loads(capsys.readouterr().out)
     names = {(c["name"], c["method"]) for c in result["components"]}
     assert {("plant step", m) for m in ("closed_form", "multiple_shooting", "single_shooting")} <= names
@@ -83,15 +83,15 @@ def test_timing(scene, tmp_path, capsys, monkeypatch):
         assert component["n"] > 0
     step = next(c for c in result["components"] if c["name"] == "control step")
     assert set(step["misses"]) == {"100 Hz", "200 Hz", "500 Hz"}
-    assert step["n"] == 80
+    assert step["n"] == 40
     assert len(step["first"]) == 20
-    assert sum(sum(counts) for counts in result["histogram"]["control step"].values()) == 80
+    assert sum(sum(counts) for counts in result["histogram"]["control step"].values()) == 40
     assert step["interrupted"] == 0
-    assert sum(row["n"] for row in result["iterations"]) == 80
+    assert sum(row["n"] for row in result["iterations"]) == 40
     assert sum(result["control_parts"].values()) == pytest.approx(step["mean"])
     solvers = {row["solver"]: row for row in result["solvers"]}
     assert list(solvers) == ["OSQP", "DAQP"]
-    assert solvers["OSQP"]["n"] == 80
+    assert solvers["OSQP"]["n"] == 40
     for row in solvers.values():
         assert 0 < row["inside"]["p50"] < row["step"]["p50"] <= row["step"]["p99"] <= row["step"]["max"]
     assert 1 <= solvers["DAQP"]["iterations"]["max"] < solvers["OSQP"]["iterations"]["p50"]

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from pcr_mpc import ModelError, load_scene, load_tuning, make_controller, simulate
@@ -47,7 +48,8 @@ def test_what_does_not_go_together_is_named(tmp_path, keys, problem):
 
 def test_the_controller_wants_the_inertia_that_the_robot_has():
     """On the robot whose rods have mass a model with mass is three times better, on the one of the paper worse."""
-    scene = replace(load_scene(MODELS / "scenes" / "lemniscate.toml"), duration=1.3)
+    scene = load_scene(MODELS / "scenes" / "lemniscate.toml")
+    scene = replace(scene, duration=0.6, trajectory=replace(scene.trajectory, ramp=0.3))
     errors = {}
     for of_plant, integrator in (("none", "rk4"), ("condensed", "rk4"), ("full", "gauss")):
         plant = replace(scene.plant, inertia=of_plant, integrator=integrator, dt=2e-3)
@@ -55,7 +57,7 @@ def test_the_controller_wants_the_inertia_that_the_robot_has():
             tuning = replace(scene.tuning, model=replace(scene.tuning.model, inertia=of_model))
             case = replace(scene, plant=plant, tuning=tuning)
             run = simulate(case, case.make_plant(), make_controller(case))
-            errors[of_plant, of_model] = run.summary()["rms_after_1s_mm"]
+            errors[of_plant, of_model] = np.sqrt((run.error[run.t > 0.2] ** 2).mean())
     assert errors["condensed", "condensed"] < 0.5 * errors["condensed", "none"]
     assert errors["none", "none"] < 0.5 * errors["none", "condensed"]
     for of_model in ("none", "condensed"):
@@ -64,7 +66,7 @@ def test_the_controller_wants_the_inertia_that_the_robot_has():
 
 def test_the_feed_forward_carries_the_inertia_of_the_rods():
     """Open loop on rods of distributed mass; at 2 ms little is lost by the rates' being held over the periods."""
-    scene = replace(load_scene(MODELS / "scenes" / "lemniscate.toml"), duration=0.8, period=2e-3)
+    scene = replace(load_scene(MODELS / "scenes" / "lemniscate.toml"), duration=0.4, period=2e-3)
     scene = replace(scene, plant=replace(scene.plant, inertia="full", integrator="gauss", dt=2e-3))
     tuning = load_tuning(CONTROLLERS / "open_loop.toml")
     errors = {}
@@ -72,12 +74,12 @@ def test_the_feed_forward_carries_the_inertia_of_the_rods():
         controller = make_controller(scene, replace(tuning, model=replace(tuning.model, inertia=inertia)))
         errors[inertia] = simulate(scene, scene.make_plant(), controller).summary()["rms_mm"]
     # Without M_pq it would be 0.005 mm, with dT/dp twice 0.001 mm.
-    assert errors["condensed"] < 4e-4 < 0.02 < errors["none"]
+    assert errors["condensed"] < 4e-4 < 0.01 < errors["none"]
 
 
 def test_heavy_rods_are_driven_better_by_a_model_that_knows_their_inertia():
     """Both by multiple shooting, for heavy rods sag."""
-    scene = replace(load_scene(MODELS / "scenes" / "heavy_rods.toml"), duration=0.6)
+    scene = replace(load_scene(MODELS / "scenes" / "heavy_rods.toml"), duration=0.3)
     shooting = replace(scene.plant, method="multiple_shooting", weight="exact", inertia="condensed")
     scene = replace(scene, plant=replace(shooting, integrator="velocity_verlet", dt=2e-3))
     errors = {}

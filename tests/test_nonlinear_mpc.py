@@ -35,7 +35,7 @@ def make_nonlinear_mpc(robot, pose, tuning, limits, **options):
 
 @pytest.fixture(scope="module")
 def tuning():
-    return load_tuning(CONTROLLERS / "default.toml")
+    return replace(load_tuning(CONTROLLERS / "default.toml"), horizon=5)  # IPOPT takes long to set up
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +229,7 @@ def test_short_horizons(tuning, target, centre, model, pair, wide, horizon):
 
 
 def test_three_rods(tuning, wide):
-    scene = load_scene(MODELS / "scenes" / "three_rods.toml")
+    scene, tuning = load_scene(MODELS / "scenes" / "three_rods.toml"), replace(tuning, horizon=10)
     pose = scene.start()
     x = np.concatenate([pose.p, [0.0, 0.0], pose.q])
     plant = Plant(scene.robot)

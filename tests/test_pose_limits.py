@@ -38,7 +38,7 @@ STRICT = PoseLimits(0.5, (-0.1, 0.0), (0.1, 0.3), rod_margin=0.6, stiffness=100.
 
 @pytest.fixture(scope="module")
 def scene():
-    return replace(load_scene(MODELS / "scenes" / "lemniscate.toml"), duration=2.0)
+    return replace(load_scene(MODELS / "scenes" / "lemniscate.toml"), duration=1.5)
 
 
 def quantities(eq):
@@ -170,8 +170,8 @@ def test_tip_region_is_kept_in_closed_loop(scene):
     assert np.abs(found.x[:, 0]).max() < 0.045 + 2e-5
     assert found.x[:, 1].max() < 0.27 + 2e-5
     summary = found.summary()
-    assert summary["control_rungs"] == {"solved": 200}
-    assert summary["active_limits"]["tip region"] > 50
+    assert summary["control_rungs"] == {"solved": 150}
+    assert summary["active_limits"]["tip region"] > 30
     assert summary["limit_violations"] == 0
 
 
@@ -194,7 +194,7 @@ def test_the_controller_does_not_drive_through_a_fold(pair):
     scene = replace(
         load_scene(MODELS / "scenes" / "lemniscate.toml"),
         robot=robot,
-        duration=2.5,
+        duration=2.2,
         trajectory=PickAndPlace((0.0, 0.25), (0.0, 0.02), 0.0, 0.2, 1.5),
         force=(5.0, 5.0),
         tuning=load_tuning(CONTROLLERS / "frozen.toml"),
@@ -207,7 +207,7 @@ def test_the_controller_does_not_drive_through_a_fold(pair):
     assert found.verdict() == ""
     plant = Plant(robot)
     plant.reset(found.x[0], found.pose)
-    verdicts = [assess_stability(plant.equilibrium(x)) for x in found.x[::10]]
+    verdicts = [assess_stability(plant.equilibrium(x)) for x in found.x[::40]]
     assert min(v.stiffness_eigenvalues[0] for v in verdicts) > 18.0
     assert min(v.rod_margins.min() for v in verdicts) > 0.095
     assert found.summary()["active_limits"]["stiffness"] > 50

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,9 +86,32 @@ def test_times_beyond_the_ends_count_at_the_ends(scene, monkeypatch):
     assert sum(counts["collector on"]) == 2
 
 
+def test_each_method_is_called_as_often_as_is_said_and_has_its_error(monkeypatch):
+    """By multiple shooting a fifth of the steps, by single shooting a hundredth."""
+    calls = []
+
+    def counted(plant, run, n):
+        calls.append((plant.method, n))
+        return SimpleNamespace(record=lambda name, method, *_: {"name": name, "method": method})
+
+    monkeypatch.setattr(timing, "_plant_times", lambda plant, scene, run, n, label: counted(plant, run, n))
+    monkeypatch.setattr(timing, "_force_times", counted)
+    monkeypatch.setattr(timing, "_counts", lambda times: {})
+    monkeypatch.setattr(timing, "call_overhead", lambda *_: [])
+    release = replace(load_scene(MODELS / "scenes" / "release.toml"), duration=0.1)
+    found = timing.time_scene(release, 10_000)
+    each = [("closed_form", 10_000), ("multiple_shooting", 2_000), ("single_shooting", 100)]
+    assert calls == [(release.plant.method, 10_000)] + [call for call in each for _ in range(2)]
+    errors = {c["method"]: c["force_error"] for c in found["components"] if c["name"] == "plant step"}
+    assert errors["closed_form"] < 1e-11
+    assert 1e-10 < errors["multiple_shooting"] < 1e-5
+    assert 0.0 < errors["single_shooting"] < 1e-4
+
+
 # --- tuning -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("quick_storage")
 def test_the_sampler_has_the_seed_of_the_search(scene, tmp_path, monkeypatch):
     """Another seed, other trials; that the same gives the same is tested elsewhere."""
     pytest.importorskip("optuna")

@@ -38,7 +38,7 @@ def check(pair, count, method, reach, seed, solved_at_least):
 
 
 def test_multiple_shooting(pair):
-    check(pair, 60, "multiple_shooting", 0.97, seed=1, solved_at_least=0.97)
+    check(pair, 20, "multiple_shooting", 0.97, seed=1, solved_at_least=0.97)
 
 
 @pytest.mark.slow

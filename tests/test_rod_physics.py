@@ -311,8 +311,8 @@ def test_wrong_properties_are_named(pair, key, value):
 
 def test_vertical_robot_tracks_and_what_leaving_the_weight_out_costs():
     """A model without weight leans on its observer; without one it misses by millimetres."""
-    scene = replace(load_scene(MODELS / "scenes/vertical.toml"), duration=1.5)
-    exact = replace(scene.plant, method="multiple_shooting", weight="exact", integrator="velocity_verlet", dt=1e-3)
+    scene = replace(load_scene(MODELS / "scenes/vertical.toml"), duration=0.8)
+    exact = replace(scene.plant, method="multiple_shooting", weight="exact", integrator="velocity_verlet", dt=2e-3)
     scene = replace(scene, plant=exact)
     weightless = scene.robot.weightless()
     errors = {}

@@ -76,7 +76,7 @@ def test_peak_torque_is_that_of_the_statics(run, pair):
 
 def test_controllers_plan_and_plant_are_separate_objects(lemniscate):
     """A controller that believes in softer rods tracks worse: it does not peek at the plant."""
-    scene = replace(lemniscate, duration=1.5)
+    scene = replace(lemniscate, duration=1.2)
     soft = replace(
         scene.robot, rods=tuple(replace(rod, bending_stiffness=0.8 * rod.bending_stiffness) for rod in scene.robot.rods)
     )
@@ -92,19 +92,10 @@ def test_a_robot_with_multiple_shooting_in_the_plant(lemniscate):
 
 
 def test_three_rods_are_tracked():
-    scene = replace(load_scene(SCENES / "three_rods.toml"), duration=1.5)
+    scene = replace(load_scene(SCENES / "three_rods.toml"), duration=1.2)
     run = simulate(scene, scene.make_plant(), make_controller(scene))
     assert run.summary()["rms_after_1s_mm"] < 6e-4
-    assert run.u.shape == (150, 3)
-
-
-@pytest.mark.parametrize(("name", "largest"), [("hold_slow", 5e-5), ("near_straight", 8e-3), ("curved_rods", 8e-3)])
-def test_scenes_that_ask_for_another_rung_are_tracked(name, largest):
-    """Largest error [mm] of the beginning; the README has the errors of the whole."""
-    scene = replace(load_scene(SCENES / f"{name}.toml"), duration=0.3)
-    summary = simulate(scene, scene.make_plant(), make_controller(scene)).summary()
-    assert summary["max_mm"] < largest
-    assert (summary["failures"], summary["limit_violations"], summary["fallbacks"]) == (0, 0, 0)
+    assert run.u.shape == (120, 3)
 
 
 def test_release_swings_about_the_balance():
