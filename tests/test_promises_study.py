@@ -104,7 +104,7 @@ def test_figures_of_a_choice_are_written_in_millimetres_and_read_back_in_metres(
     path = tmp_path / "mine" / "release.toml"
     path.parent.mkdir()
     path.write_text((SCENES / "release.toml").read_text().replace("../", "../models/", 1))
-    choice = made_up_choice(release, {"a": Estimate(3e-7, ""), "b": Estimate(4.1237e-7, "")})
+    choice = made_up_choice(release, {"a": Estimate(3e-7, ""), "b": Estimate(4.12e-7, "")})
     write_rung(choice, path)
     finding = load_scene(path).finding
     assert finding.tip_error == pytest.approx(1.912e-6, rel=3e-3)

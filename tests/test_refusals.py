@@ -9,7 +9,9 @@ import pytest
 
 from pcr_mpc import ConvergenceError, ModelError, PCRError, Plant, forward_statics, load_robot, load_scene
 from pcr_mpc.buffered import BufferedFunction
+from pcr_mpc.cli_study import _ended
 from pcr_mpc.compiled import compiled
+from pcr_mpc.control.daqp_solver import DAQPSolver
 from pcr_mpc.control.nonlinear_mpc import NonlinearMPC
 from pcr_mpc.control.osqp_solver import QPSolver
 from pcr_mpc.control.qp import constraint_matrix
@@ -159,3 +161,14 @@ def test_what_a_solver_refuses_is_not_passed_over():
     with pytest.raises(RuntimeError, match="OSQP refused warm_start with code 3; the old data are still in place"):
         qp._require(3, "warm_start")
     qp._require(0, "warm_start")
+    with pytest.raises(
+        RuntimeError, match="DAQP refused update with code -3; the data are lost, call update with good"
+    ):
+        DAQPSolver(constraint_matrix(2, 2))._require(-3, "update")
+
+
+def test_a_command_whose_results_are_elsewhere_fails_with_the_place(tmp_path):
+    assert _ended("", tmp_path) == 0
+    with pytest.raises(OutputError, match="disk full; the results are in") as caught:
+        _ended("disk full; the results are in /tmp/x", tmp_path)
+    assert caught.value.path == str(tmp_path)

@@ -272,6 +272,8 @@ def test_without_optuna_it_says_what_to_install(search, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(PCRError, match=r"pip install pcr_mpc\[tune\]"):
         tuning_study.tune(search, 1, Here(), progress=False)
+    with pytest.raises(PCRError, match=r"pip install pcr_mpc\[tune\]"):
+        tuning_space.space(search)
 
 
 def test_a_written_tuning_reads_back(tmp_path):
