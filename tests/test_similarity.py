@@ -192,10 +192,14 @@ def test_snap(pair, centre, units):
     assert ends[0] == pytest.approx(ends[1], rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    "units", [*UNITS[:2], *(pytest.param(of, marks=pytest.mark.slow) for of in UNITS[2:])], ids=IDS
-)
-@pytest.mark.parametrize("name", ["default", pytest.param("lemniscate", marks=pytest.mark.slow)])
+TRACKED = [
+    pytest.param(units, name, id=f"{name}-{id_}", marks=() if name == "default" and k < 2 else pytest.mark.slow)
+    for name, count in (("default", 5), ("lemniscate", 2))
+    for k, (units, id_) in enumerate(zip(UNITS[:count], IDS[:count], strict=True))
+]
+
+
+@pytest.mark.parametrize(("units", "name"), TRACKED)
 def test_tracking(units, name):
     """The closed loop with an observer, an unknown load and a sensor."""
     assert_similar(units, name)
