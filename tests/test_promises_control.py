@@ -71,6 +71,18 @@ def test_no_surprise_no_change(observer):
     assert not observer.force.any()
 
 
+def test_what_is_not_measured_is_as_predicted(observer):
+    x, found = observer.x.copy(), []
+    tip, angles = x[:2] + [1e-3, -2e-3], x[4:] + 0.05
+    for p, q in ((tip, None), (tip, x[4:]), (None, angles), (x[:2], angles), (None, None)):
+        observer.start(x)
+        observer.correct(p, q)
+        found.append([*observer.x, *observer.force])
+    assert found[0] == found[1] != found[4]
+    assert found[2] == found[3] != found[4]
+    assert found[4] == [*x, 0.0, 0.0]
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_an_unknown_force_is_found_with_its_sign(observer, model, sign):
     force, x = sign * np.array([0.3, -0.2]), observer.x.copy()
