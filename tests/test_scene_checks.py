@@ -40,6 +40,7 @@ def scene():
         ({"duration": 2.0049}, "duration is 2.0049 s, which is no whole number .* of 0.01 s; take 2 or"),
         ({"tip_noise": -1e-3}, "tip_noise: is -0.001"),
         ({"angle_step": math.nan}, "angle_step: expected a number"),
+        ({"angle_step": -1e-9}, "angle_step: is -1e-09, expected a finite number >= 0"),
         ({"delay": -1}, "delay is -1, expected a whole number"),
         ({"delay": 1.5}, "delay is 1.5"),
         ({"deadline": -1.0}, "deadline: is -1"),

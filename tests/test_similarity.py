@@ -90,7 +90,7 @@ def test_balance(laden, units):
 @pytest.fixture(scope="module")
 def listed(laden):
     """All free poses of a robot whose rods can meet in a small region only, which keeps the search short."""
-    rods = (replace(laden.rods[0], base=(-0.36, 0.0)), replace(laden.rods[1], base=(0.36, 0.0)))
+    rods = (replace(laden.rods[0], base=(-0.34, 0.0)), replace(laden.rods[1], base=(0.34, 0.0)))
     robot, q, push = replace(laden, rods=rods), (1.0, 1.9), (0.1, 0.0)
     return robot, q, push, all_equilibria(robot, q=q, force=push)
 
