@@ -139,6 +139,20 @@ def least_gain(matrix: np.ndarray) -> float:
     return float(np.linalg.norm(np.stack([np.cos(angles), np.sin(angles)], axis=1) @ matrix, axis=1).min())
 
 
+@pytest.mark.parametrize("half", [0.36, 0.385])
+def test_rods_that_only_just_meet_have_a_free_pose(pair, half):
+    """By another method, and the one of least energy of those that a search over the whole region lists."""
+    rods = [replace(rod, base=(math.copysign(half, rod.base[0]), 0.0), angle_limits=(-4.0, 4.0)) for rod in pair.rods]
+    robot = replace(pair, rods=tuple(rods))
+    q = (1.0, math.pi - 1.0)
+    eq = forward_statics(robot, q)
+    assert eq.stable
+    again = solve_statics(robot, eq.p, q, method="multiple_shooting", guess=eq)
+    assert again.force == pytest.approx([0.0, 0.0], abs=1e-4)
+    if half == 0.36:
+        assert eq.p == pytest.approx(all_equilibria(robot, q=q)[0].p, abs=1e-7)
+
+
 def test_motor_authority_is_the_force_that_motors_move_least(poses):
     for eq in poses:
         verdict = assess_stability(eq)

@@ -358,10 +358,13 @@ def _tip_starts(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
     radius = 0.5 * robot.lengths.min()
     starts = [straight.mean(axis=0)]
     starts += [centre + radius * np.array([np.cos(a), np.sin(a)]) for a in np.pi * np.arange(8) / 4 + np.pi / 2]
+    # Of rods that only just meet, half of what is left between there and straight.
+    closest = float((np.linalg.norm(centre - robot.bases, axis=1) / robot.lengths).max())
+    reach = max(0.9, (1.0 + closest) / 2)
     inside = []
     for start in starts:
         for _ in range(60):
-            if (np.linalg.norm(start - robot.bases, axis=1) < 0.9 * robot.lengths).all():
+            if (np.linalg.norm(start - robot.bases, axis=1) < reach * robot.lengths).all():
                 inside.append(start)
                 break
             start = start + 0.1 * (centre - start)
