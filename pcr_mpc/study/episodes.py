@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,10 +20,12 @@ from ..errors import SimulationError, checked_integer, checked_number
 from ..loop.controllers import Controller
 from ..loop.feed_forward import InverseDynamics, feed_forward
 from ..loop.own_controller import built
+from ..loop.references.reading import built_in
 from ..loop.run import Run
 from ..loop.scene import Scene
 from ..loop.simulate import simulate
 from ..loop.tracking import make_controller
+from ..loop.trajectory import Trajectory, sampled
 
 Row = dict[str, Any]
 Maker = Callable[..., Controller]
@@ -212,11 +215,31 @@ def simulate_episode(
     if believed.trajectory is not None:
         tail = tuning.horizon + believed.delay
         payload = believed.payload if tuning.model.payload else None
-        reference = _reference(replace(believed, tuning=None, payload=payload), tail, tuning.model.inertia)
+        known = replace(believed, tuning=None, payload=payload, trajectory=_comparable(believed, tail))
+        reference = _reference(known, tail, tuning.model.inertia)
     controller = make_controller(
         replace(believed, angle_step=true.angle_step), robot=believed.robot, reference=reference
     )
     return simulate(true, true.make_plant(), controller, seed, progress=progress)
+
+
+@dataclass(frozen=True)
+class _BySamples:
+    """A trajectory of one's own, which may not be hashed, and in a worker is another object with every task."""
+
+    digest: str
+    trajectory: Trajectory = field(compare=False)
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        return self.trajectory(t)
+
+
+def _comparable(believed: Scene, horizon: int) -> Trajectory | None:
+    trajectory = believed.trajectory
+    if trajectory is None or built_in(trajectory):
+        return trajectory
+    samples = sampled(trajectory, believed.period * np.arange(believed.n_periods + horizon + 1))
+    return _BySamples(hashlib.sha256(samples.tobytes()).hexdigest(), trajectory)
 
 
 @lru_cache(maxsize=8)

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import pickle
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
@@ -76,9 +80,62 @@ class _Workers(ProcessPoolExecutor):
     """Workers that Ctrl-C in a terminal, which reaches all processes, does not stop: the parent does."""
 
     def submit(self, *arguments: Any, **keywords: Any) -> Any:
-        """See `Executor`; this is where processes are started."""
+        """See `Executor`; this is where processes are started.
+
+        Raises
+        ------
+        StudyError
+            What is to be worked on cannot be sent to another process; names what of it. None is started then.
+        """
+        require_portable(arguments)
         with interrupt.held_back():
             return super().submit(*arguments, **keywords)
+
+
+def require_portable(task: Sequence[Any]) -> None:
+    """Raise if a function with its arguments cannot be sent to a new process.
+
+    Raises
+    ------
+    StudyError
+        Names the part that cannot, such as the reference of a scene, and what to do.
+    """
+    try:
+        pickled = pickle.dumps(task)
+    except Exception as error:  # whatever a foreign object does when it is pickled
+        name, part = _unportable("task", task)
+        raise StudyError(
+            f"{name} is {part!r}, which cannot be sent to worker processes: {error}; take a function or a class that "
+            "stands at the top of a module, not a lambda or one within a function",
+            part=name,
+        ) from error
+    main = sys.modules.get("__main__")
+    if b"__main__" in pickled and getattr(main, "__file__", None) is None:
+        raise StudyError(
+            "what is to be worked on was made in an interactive session, whose functions and classes worker processes "
+            "do not find; put them into a module, and import it",
+            part="__main__",
+        )
+
+
+def _unportable(name: str, thing: Any) -> tuple[str, Any]:
+    """The innermost part that cannot be pickled, and where it is."""
+    if isinstance(thing, partial):
+        parts = [(f"argument {i}", each) for i, each in enumerate(thing.args)] + list(thing.keywords.items())
+        parts.append((getattr(thing.func, "__name__", "function"), thing.func))
+    elif is_dataclass(thing) and not isinstance(thing, type):
+        kind = type(thing).__name__.lower()
+        parts = [(f"{kind}.{field.name}", getattr(thing, field.name)) for field in fields(thing)]
+    elif isinstance(thing, tuple | list):
+        parts = [(f"{name}[{i}]", each) for i, each in enumerate(thing)]
+    else:
+        parts = []
+    for inner, part in parts:
+        try:
+            pickle.dumps(part)
+        except Exception:
+            return _unportable(inner, part)
+    return name, thing
 
 
 def _follow_the_parent() -> None:
