@@ -33,6 +33,7 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
 	$(BIN)/python experiments/rod_inertia.py --out docs
 	$(BIN)/python -m experiments.mujoco_agreement --out docs
 	$(BIN)/python -m experiments.growth --out docs
+	$(BIN)/python -m experiments.path_kinds --out docs
 	$(BIN)/python experiments/rungs.py --out docs
 	$(BIN)/python experiments/workspace.py --out results/workspace
 	cp results/workspace/*.png docs/

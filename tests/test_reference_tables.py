@@ -1,6 +1,7 @@
 """The [reference] table: every kind with its keys and options, and what is wrong by name."""
 
 import math
+import re
 import tomllib
 
 import numpy as np
@@ -136,3 +137,19 @@ def test_tip_and_duration_may_be_left_to_the_reference(tmp_path):
     path.write_text(text.replace('mode = "LR"', ""))
     with pytest.raises(ModelError, match="give either tip and mode, or motors"):
         load_scene(path)
+
+
+def test_the_page_s_tables_are_read_and_its_python_runs(monkeypatch, capsys):
+    page = (MODELS.parent / "docs" / "paths.md").read_text(encoding="utf-8")
+    tables = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert len(tables) == 7
+    for table in tables:
+        path = read(table.replace("[reference]\n", ""))
+        assert 0.9 < path.duration < 10.0
+        assert path(np.array([0.0, path.duration]))[:, 1:] == pytest.approx(np.zeros((2, 2, 2)), abs=1e-9)
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(MODELS.parent)
+    exec(code, {})
+    said = re.findall(r"print\(.*\)  # (\S+)", code)
+    for stated, printed in zip(said, capsys.readouterr().out.split(), strict=True):
+        assert stated == printed or float(stated) == pytest.approx(float(printed), rel=0.05)

@@ -109,12 +109,17 @@ def reference_demand(scene: Scene, reference: InverseDynamics) -> dict[str, Any]
     names = ("rate_rad_s", "rate_change_rad_s2", "torque_Nm")
     for name, values, limit in zip(names, motors, limits, strict=True):
         k, i = np.unravel_index(int(np.abs(values).argmax()), values.shape)
-        said[name] = {"asked": abs(float(values[k, i])), "limit": limit, "motor": int(i), "t_s": int(k) * period}
+        said[name] = {
+            "asked": abs(float(values[k, i])),
+            "limit": limit,
+            "motor": int(i),
+            "t_s": _moment(int(k), period),
+        }
     assert scene.trajectory is not None
     motion = np.linalg.norm(sampled(scene.trajectory, period * np.arange(count + 1))[:, 1:], axis=2)
     for j, name in enumerate(("speed_m_s", "acceleration_m_s2")):
         at = int(motion[:, j].argmax())
-        said[name] = {"asked": float(motion[at, j]), "t_s": at * period}
+        said[name] = {"asked": float(motion[at, j]), "t_s": _moment(at, period)}
     for name, values, least in (
         ("rod_margin", reference.rod_margin, scene.pose_limits.rod_margin),
         ("stiffness_N_m", reference.stiffness, scene.pose_limits.stiffness),
@@ -122,8 +127,12 @@ def reference_demand(scene: Scene, reference: InverseDynamics) -> dict[str, Any]
         values = values[: count + 1]
         if np.isfinite(values).any():
             at = int(np.nanargmin(values))
-            said[name] = {"asked": float(values[at]), "limit": least, "t_s": at * period}
+            said[name] = {"asked": float(values[at]), "limit": least, "t_s": _moment(at, period)}
     return said
+
+
+def _moment(k: int, period: float) -> float:
+    return round(k * period, 9)
 
 
 def demand_line(demand: dict[str, Any]) -> str:
