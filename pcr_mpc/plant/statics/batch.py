@@ -21,7 +21,7 @@ from .equilibrium import Equilibrium, moment_units
 from .first_rung import Climbed
 from .held_tip import Way, chosen_way, solver_of
 from .solver import RodSolver
-from .state import columns
+from .state import columns, record_size
 
 # Poses in one call of a graph: each size is built once.
 _SIZES, _GROWTH = (512, 64, 8, 1), 8
@@ -34,7 +34,7 @@ def solve_statics_batch(
     p: Any,
     q: Any,
     *,
-    guess: Equilibrium | None = None,
+    guess: Equilibrium | Equilibria | None = None,
     along: bool = False,
     method: str | None = None,
     segments: int = 8,
@@ -51,8 +51,9 @@ def solve_statics_batch(
         Tip positions [m].
     q : array_like, shape (R, n)
         Motor angles [rad].
-    guess : Equilibrium, optional
-        Whose branch is followed to each pose. None: on the branch of least energy.
+    guess : Equilibrium or Equilibria, optional
+        Whose branch is followed to each pose; many of the same robot: each from its own. None: on the branch of least
+        energy.
     along : bool
         Whether the poses are a path: the branch is followed from each that is solved to the next, from the guess, or
         from the first pose, solved cold. Otherwise each is followed to from the guess, or solved cold, which is slow.
@@ -75,6 +76,8 @@ def solve_statics_batch(
     p, q = _rows("p", p, 2), _rows("q", q, robot.n_rods)
     if len(p) != len(q):
         raise ValueError(f"p has {len(p)} rows, q {len(q)}")
+    if isinstance(guess, Equilibria):
+        return _each_from_its_own(robot, p, q, guess, chosen_way(robot, method, segments, steps, scheme), compiled)
     if guess is not None and not isinstance(guess, Equilibrium):
         raise TypeError(f"guess is a {type(guess).__name__}, expected an Equilibrium")
     if guess is not None and guess.robot.n_rods != robot.n_rods:
@@ -86,6 +89,20 @@ def solve_statics_batch(
         work.by_graphs(solver, guess, along=along)
     else:
         work.one_by_one(range(len(p)), guess, along=along)
+    return work.result()
+
+
+def _each_from_its_own(
+    robot: Robot, p: np.ndarray, q: np.ndarray, guess: Equilibria, way: Way, compiled: bool
+) -> Equilibria:
+    solver = solver_of(robot, way.method, way.shooting)
+    if guess.robot != robot or len(guess.p) != len(p) or guess.method != way.method or not isinstance(solver, RodSolver):
+        raise ValueError(
+            f"guess holds {len(guess.p)} poses of {guess.robot.name} by {guess.method}, expected {len(p)} of {robot.name} "
+            f"by {way.method}, and another method than single_shooting"
+        )
+    work = _Work(robot, p, q, way, compiled)
+    work.from_records(solver, guess.records)
     return work.result()
 
 
@@ -117,6 +134,7 @@ class _Work:
         }
         self.arrays = {name: np.full((count, *shape), np.nan) for name, shape in shapes.items()}
         self.unstable = np.zeros((count, n), dtype=bool)
+        self.records = np.full((count, record_size(widths[way.method], n)), np.nan)
         self.reasons = [""] * count
         self._wanted = np.full(count, np.inf)  # drift
         self._kind = Kind(n, robot_layout(robot))
@@ -131,6 +149,7 @@ class _Work:
             self.way.method,
             unstable=self.unstable,
             reason=tuple(self.reasons),
+            records=self.records,
             **self.arrays,
         )
 
@@ -157,22 +176,40 @@ class _Work:
         unknowns = eq.nodes.transpose(0, 2, 1).reshape(n, -1) if eq.record is None else columns(eq.record, n).unknowns.T
         self.arrays["unknowns"][row] = unknowns
         self.unstable[row, list(eq.unstable_rods)] = True
+        if eq.record is not None:
+            self.records[row] = eq.record
         return eq
 
     def by_graphs(self, solver: RodSolver, guess: Equilibrium | None, *, along: bool) -> None:
         """Solve blocks of rows in one call each, and alone those that a few Newton iterations do not bring along."""
-        slack = [1 - np.linalg.norm(self.p - rod.base, axis=1) / rod.length for rod in self.robot.rods]
-        # Written so that NaN is not fit.
-        fit = (np.abs(self.q).max(axis=1) < _LARGE) & (np.min(slack, axis=0) > _DOUBTFUL)
-        if self.way.refined:
-            self._wanted[fit] = [self.way.wanted_drift(self.robot, p) for p in self.p[fit]]
+        fit = self._fit()
         last = self._known(solver, guess)
         if along:
             self._follow(solver, guess, last, fit)
             return
         if last is not None:
-            self._spread(solver.method, last, np.flatnonzero(fit))
+            rows = np.flatnonzero(fit)
+            self._spread(solver.method, np.broadcast_to(_record(last), (len(rows), len(_record(last)))), rows)
         self.one_by_one(np.flatnonzero(np.isnan(self.arrays["residual_norm"])), guess, along=False)
+
+    def from_records(self, solver: RodSolver, records: np.ndarray) -> None:
+        """Solve each row from a record of its own; those that cannot be followed to are left with a reason."""
+        known = self._fit() & np.isfinite(records).all(axis=1)
+        self._spread(solver.method, records[known], np.flatnonzero(known))
+        for row in np.flatnonzero(np.isnan(self.arrays["residual_norm"])):
+            self.reasons[row] = (
+                f"the rods could not be followed in one step to p = {self.p[row]} m, q = {self.q[row]} rad; guess from "
+                "a nearer pose, or along a path"
+            )
+
+    def _fit(self) -> np.ndarray:
+        """Whether rows are for graphs, and need no checks of their own; sets how exact they are to be."""
+        slack = [1 - np.linalg.norm(self.p - rod.base, axis=1) / rod.length for rod in self.robot.rods]
+        # Written so that NaN is not fit.
+        fit = (np.abs(self.q).max(axis=1) < _LARGE) & (np.min(slack, axis=0) > _DOUBTFUL)
+        if self.way.refined:
+            self._wanted[fit] = [self.way.wanted_drift(self.robot, p) for p in self.p[fit]]
+        return np.asarray(fit)
 
     def _known(self, solver: RodSolver, guess: Equilibrium | None) -> Equilibrium | None:
         """Return a guess with a record of this robot and method, if it can be had."""
@@ -211,9 +248,8 @@ class _Work:
             # Small blocks after a row that failed, where others may: what is behind it was for nothing.
             size = min(_GROWTH * size, _SIZES[0]) if done == size else _SIZES[-1]
 
-    def _spread(self, method: RodMethod, guess: Equilibrium, rows: np.ndarray) -> None:
-        """Solve rows from one equilibrium; a second time from where the first led, if that was on its branch."""
-        starts = np.broadcast_to(_record(guess), (len(rows), len(_record(guess))))
+    def _spread(self, method: RodMethod, starts: np.ndarray, rows: np.ndarray) -> None:
+        """Solve rows from records; a second time from where the first led, if that was on their branch."""
         changed = np.zeros(len(rows))
         for _ in range(2):
             again, reached, first = np.zeros(len(rows), dtype=bool), [], 0
@@ -260,6 +296,7 @@ class _Work:
         scalars = records[:, -5 * n :].reshape(count, n, 5)
         load_tangents = records[:, -14 * n : -5 * n].reshape(count, n, 3, 3)  # of a rod: by column, that is by pose
         loads = records[:, -17 * n : -14 * n].reshape(count, n, 3)
+        self.records[rows] = records
         to["unknowns"][rows] = records[:, : to["unknowns"][0].size].reshape(count, n, -1)
         to["force"][rows] = results[:, :2]
         to["dforce_dp"][rows] = results[:, 2:6].reshape(count, 2, 2).transpose(0, 2, 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,8 @@ class Equilibria(Frozen):
         Why a pose was not solved; empty where it was.
     unknowns : ndarray, shape (R, n, u)
         Of the method, from which `nodes` are made.
+    records : ndarray, shape (R, r)
+        What a solver needs to go on from each (see `RobotState`); NaN where it has none.
     """
 
     robot: Robot
@@ -65,6 +67,7 @@ class Equilibria(Frozen):
     unstable: np.ndarray
     reason: tuple[str, ...]
     unknowns: np.ndarray
+    records: np.ndarray
 
     @property
     def solved(self) -> np.ndarray:
@@ -78,6 +81,11 @@ class Equilibria(Frozen):
         # The lesser eigenvalue of a symmetric matrix; NaN is not stable.
         least = (a + d) / 2 - np.hypot((a - d) / 2, (b + c) / 2)
         return np.asarray(~self.unstable.any(axis=1) & (least > 0))
+
+    def rows(self, which: np.ndarray) -> Equilibria:
+        """Return some of the poses, by their indices; one may come more than once."""
+        arrays = {name: value[which] for name, value in self.__dict__.items() if isinstance(value, np.ndarray)}
+        return replace(self, reason=tuple(self.reason[row] for row in which), **arrays)
 
     def nodes(self, row: int) -> np.ndarray:
         """Nodes of the rods at one pose, shape (n, 4, N), as `Equilibrium.nodes`: also a guess for `solve_statics`.

@@ -1,0 +1,143 @@
+"""Motor angles along a motion: inverse statics at many points in one call, and how they change with the forces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from ...errors import ConvergenceError
+from ...plant.statics.batch import solve_statics_batch
+from ...plant.statics.equilibria import Equilibria
+from ...plant.statics.equilibrium import Equilibrium
+from .linear import Linear
+from .motion import Motion
+
+_MOST_STEPS = 12
+_LARGEST_STEP = 0.3  # rad
+_STEP = 1e-6  # of the motors, in radians, and of the tip, in rod lengths, for differences
+
+
+@dataclass(frozen=True, eq=False)
+class Angles:
+    """Motor angles at M points, and the motors' motion.
+
+    Attributes
+    ----------
+    q, rate, acceleration : Linear, n components
+        [rad], [rad/s], [rad/s^2].
+    torque : Linear, n components
+        [N m].
+    poses : Equilibria
+    pose : Equilibrium
+        From which their branch was followed.
+    """
+
+    q: Linear
+    rate: Linear
+    acceleration: Linear
+    torque: Linear
+    poses: Equilibria
+    pose: Equilibrium
+
+
+def balanced(
+    pose: Equilibrium, p: np.ndarray, force: np.ndarray, q: np.ndarray, near: Equilibria | None, tolerance: float
+) -> tuple[Equilibria, np.ndarray]:
+    """Turn the motors by Newton's method until the rods carry the forces, at all points at once.
+
+    Parameters
+    ----------
+    pose : Equilibrium
+        Near the first point; its branch is followed from point to point.
+    p, force : ndarray, shape (M, 2)
+        [m], [N].
+    q : ndarray, shape (M, n)
+        Guess [rad].
+    near : Equilibria or None
+        Poses near each of the points, which saves the way along the path.
+    tolerance : float
+        Force that may be missing, in units of sum EI/L^2. A last step, without a look at its result, takes it away.
+
+    Returns
+    -------
+    poses : Equilibria
+        Within the tolerance.
+    q : ndarray, shape (M, n)
+        Angles at which it is met, to the square of that [rad].
+
+    Raises
+    ------
+    ConvergenceError
+        With the first point at which it failed, ``row``.
+    """
+    robot = pose.robot
+    allowed = tolerance * robot.force_scale
+    for step in range(_MOST_STEPS):
+        poses = None if near is None else solve_statics_batch(robot, p, q, guess=near)
+        if poses is None or not poses.solved.all():
+            poses = solve_statics_batch(robot, p, q, guess=pose, along=True)
+        missed = force - poses.force
+        size = np.linalg.norm(missed, axis=1)
+        lost = np.flatnonzero(~np.isfinite(size))
+        if lost.size:
+            break
+        turn = np.einsum("mij,mj->mi", np.linalg.pinv(poses.dforce_dq), missed)
+        if (size <= allowed).all():
+            return poses, poses.q + turn
+        q = q + turn * np.minimum(1.0, _LARGEST_STEP / np.maximum(np.abs(turn).max(axis=1, keepdims=True), 1e-300))
+        near = poses
+    row = int(lost[0]) if lost.size else int(size.argmax())
+    raise ConvergenceError(
+        f"no motor angles were found at which the rods carry {force[row]} N at p = {p[row]} m: "
+        f"{poses.reason[row] or f'{size[row]:.3g} N are missing after {_MOST_STEPS} steps'}",
+        residual=float(size[row]),
+        iterations=step + 1,
+        last=q[row],
+        row=row,
+    )
+
+
+def angles(
+    moved: Motion, pose: Equilibrium, q: np.ndarray, x: np.ndarray, near: Equilibria | None, tolerance: float
+) -> Angles:
+    """Motor angles, rates and accelerations of a motion at equally spaced points x; see `balanced`."""
+    f, f1, f2 = moved.force
+    p, p1, p2 = moved.path
+    poses, q = balanced(pose, p.value, f.value, q, near, tolerance)
+    stiffness, levers = poses.dforce_dp, np.linalg.pinv(poses.dforce_dq)
+    # Along x: K P' + G q' = F', with H = G^+. The slopes: K dP + G dq = dF at every x.
+    first = f1 - p1.through(stiffness)
+    k1, h1 = _along(poses, p1.value, first.through(levers).value, levers)
+    k2, h2 = _derivative(x, k1), _derivative(x, h1)
+    push = f - p.through(stiffness)
+    push1 = f1 - p.through(k1) - p1.through(stiffness)
+    push2 = f2 - p.through(k2) - 2.0 * p1.through(k1) - p2.through(stiffness)
+    second = f2 - p1.through(k1) - p2.through(stiffness)
+    q_lin = Linear(q, push.through(levers).slope)
+    turn = Linear(first.through(levers).value, push1.through(levers).slope + push.through(h1).slope)
+    turn2 = Linear(
+        second.through(levers).value + first.through(h1).value,
+        push2.through(levers).slope + 2.0 * push1.through(h1).slope + push.through(h2).slope,
+    )
+    rate = turn * moved.theta
+    acceleration = turn2 * moved.pace + 0.5 * (turn * moved.pace_slope)
+    dtau = poses.dtorque_dq[:, :, None] * q_lin.slope + np.einsum("mji,mjd->mid", poses.dforce_dq, p.slope)
+    return Angles(q_lin, rate, acceleration, Linear(poses.motor_torque, dtau), poses, pose)
+
+
+def _along(
+    poses: Equilibria, p1: np.ndarray, q1: np.ndarray, levers: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of K and H at each pose where tip and motors move by p1 and q1: by differences, at the pose alone."""
+    size = np.abs(np.concatenate([p1 / poses.robot.lengths.mean(), q1], axis=1)).max(axis=1)
+    step = _STEP / np.maximum(size, _STEP)
+    there = solve_statics_batch(poses.robot, poses.p + step[:, None] * p1, poses.q + step[:, None] * q1, guess=poses)
+    scale = 1.0 / step[:, None, None]
+    return scale * (there.dforce_dp - poses.dforce_dp), scale * (np.linalg.pinv(there.dforce_dq) - levers)
+
+
+def _derivative(x: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """By x, as far as the slopes of the limits need it."""
+    return np.asarray(make_interp_spline(x, values.reshape(len(x), -1), k=3)(x, nu=1).reshape(values.shape))

@@ -1,0 +1,160 @@
+"""What a planned motion is to keep, each as a share of its limit, and how the shares change with the timing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ...errors import check_numbers
+from ...linearisation.pose_limits import PoseLimits
+from ...loop.scene import Scene
+from ...plant.rods.chart import LEAST_CRITICAL_LOAD, critical_load
+from ...plant.statics.batch import solve_statics_batch
+from ...plant.statics.equilibria import Equilibria
+from .angles import Angles
+from .linear import Linear
+from .motion import Motion
+
+_WATCHED = 0.8  # of a margin's limit, from which on its slope is computed
+_ANGLE = 1e-5  # by which motors are turned to see how margins change [rad]
+
+
+@dataclass(frozen=True)
+class PlanLimits:
+    """Limits of a planned motion; infinite is none.
+
+    Attributes
+    ----------
+    rate, acceleration, torque : float
+        Of every motor [rad/s], [rad/s^2], [N m].
+    tip_speed, tip_acceleration, tip_jerk : float
+        [m/s], [m/s^2], [m/s^3].
+    rod_margin : float
+        Least 1 - lambda / lambda_c of a rod; of plain rods only. -infinity is none.
+    stiffness : float
+        Least eigenvalue of K [N/m]. 0 is none.
+    """
+
+    rate: float
+    acceleration: float
+    torque: float
+    tip_speed: float = math.inf
+    tip_acceleration: float = math.inf
+    tip_jerk: float = math.inf
+    rod_margin: float = -math.inf
+    stiffness: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self)[:6]:
+            if getattr(self, field.name) != math.inf:
+                check_numbers(self, {field.name: {"above": 0.0}})
+        if self.rod_margin != -math.inf:
+            check_numbers(self, {"rod_margin": {"maximum": 0.9}})
+        check_numbers(self, {"stiffness": {"minimum": 0.0}})
+
+    @classmethod
+    def of_scene(cls, scene: Scene) -> PlanLimits:
+        """Those of a scene and its robot."""
+        poses: PoseLimits = scene.pose_limits
+        return cls(
+            scene.robot.rate_limit,
+            scene.robot.acceleration_limit,
+            scene.torque_limit,
+            rod_margin=-math.inf if poses.rod_margin is None else poses.rod_margin,
+            stiffness=poses.stiffness or 0.0,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Use:
+    """Share of a limit that is used at M points: 1 is all of it.
+
+    Attributes
+    ----------
+    limit : str
+    share : Linear
+        Its components are motors or rods, where there are several.
+    both : bool
+        Whether -1 is a bound too.
+    """
+
+    limit: str
+    share: Linear
+    both: bool
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Of the components, shape (M,)."""
+        return np.asarray((np.abs(self.share.value) if self.both else self.share.value).max(axis=1))
+
+
+def uses(limits: PlanLimits, moved: Motion, turned: Angles) -> list[Use]:
+    """Every limit that there is, by what the motion uses of it."""
+    robot = turned.poses.robot
+    low, high = robot.angle_limits.T
+    middle, half = (low + high) / 2, (high - low) / 2
+    angle = Linear((turned.q.value - middle) / half, turned.q.slope / half[:, None])
+    found = [
+        Use("motor rate", (1.0 / limits.rate) * turned.rate, both=True),
+        Use("change of rate", (1.0 / limits.acceleration) * turned.acceleration, both=True),
+        Use("motor torque", (1.0 / limits.torque) * turned.torque, both=True),
+        Use("motor angle", angle, both=True),
+    ]
+    for name, limit, vector in (
+        ("tip speed", limits.tip_speed, moved.velocity),
+        ("tip acceleration", limits.tip_acceleration, moved.acceleration),
+        ("tip jerk", limits.tip_jerk, moved.jerk),
+    ):
+        if limit != math.inf:
+            found.append(Use(name, (1.0 / limit) * vector.norm(), both=False))
+    if limits.stiffness > 0.0:
+        found.append(_stiffness(limits.stiffness, turned))
+    if limits.rod_margin > -math.inf and turned.poses.method == "closed_form":
+        found.append(_rod_margin(limits.rod_margin, turned))
+    return found
+
+
+def _stiffness(least: float, turned: Angles) -> Use:
+    """Least eigenvalue of K: the limit over it."""
+    poses = turned.poses
+    values, vectors = np.linalg.eigh((poses.dforce_dp + poses.dforce_dp.transpose(0, 2, 1)) / 2)
+    softest, vector = values[:, 0], vectors[:, :, 0]
+    # Where the pose is not even stable, what counts is that it is far beyond the limit.
+    share = least / np.maximum(softest, 0.1 * least)
+    slope = np.zeros_like(poses.q)
+    if share.max() > _WATCHED:
+        for i in range(poses.q.shape[1]):
+            change = (_turned(turned, i).dforce_dp - poses.dforce_dp) / _ANGLE
+            slope[:, i] = np.einsum("mi,mij,mj->m", vector, change, vector)
+    by_angle = -(share**2)[:, None] / least * slope
+    return Use("stiffness", Linear(share[:, None], np.einsum("mi,mid->md", by_angle, turned.q.slope)[:, None]), both=False)
+
+
+def _rod_margin(least: float, turned: Angles) -> Use:
+    """Lambda over lambda_c, over the most that is allowed."""
+    poses, most = turned.poses, 1.0 - least
+    here, slope = loads(poses, _WATCHED * most), np.zeros_like(poses.q)
+    if here.max() > _WATCHED * most:
+        # Rods do not couple at a held tip: all motors at once.
+        slope = (loads(_turned(turned, slice(None)), _WATCHED * most) - here) / _ANGLE
+    return Use("rod margin", (1.0 / most) * Linear(here, slope[:, :, None] * turned.q.slope), both=False)
+
+
+def loads(poses: Equilibria, exact_from: float) -> np.ndarray:
+    """Lambda over lambda_c of plain rods in closed form, shape (R, n); a little too much where it is less than given."""
+    robot = poses.robot
+    load = robot.lengths * np.sqrt(np.linalg.norm(poses.rod_forces, axis=2) / robot.stiffnesses)
+    critical = np.full(load.shape, LEAST_CRITICAL_LOAD)
+    for row, rod in np.argwhere(load > exact_from * LEAST_CRITICAL_LOAD):
+        critical[row, rod] = critical_load(float(poses.unknowns[row, rod, 0]))
+    return np.asarray(load / critical)
+
+
+def _turned(turned: Angles, motors: int | slice) -> Equilibria:
+    """Poses with some motors turned a little more."""
+    poses = turned.poses
+    q = poses.q.copy()
+    q[:, motors] += _ANGLE
+    return solve_statics_batch(poses.robot, poses.p, q, guess=poses)

@@ -1,0 +1,81 @@
+"""Points at which limits are kept, and a course whose points lie where the time is spent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+from scipy.interpolate import CubicSpline
+from scipy.sparse.linalg import spsolve
+
+from .course import PacedPath
+from .fastest import Timing, evaluated
+from .pace import constant_pace, duration, spline_of, times, unit_splines
+
+PER_CELL = 3
+FINE = 10  # points to a cell where the result is checked
+_AT_ENDS = 8  # in the first and the last cell: there the tip hardly moves, and b is free to do much
+_BY_TIME = 0.8  # of the new course goes by time, the rest as before
+_SAMPLES = 4001
+_NEAR_REST = 1e-3  # of the largest speed, below which nothing is learnt of the pace
+_SMOOTHING = 1e-3
+_SLOWEST = 0.05  # of the mean b
+
+
+def points(cells: int, per_cell: int = PER_CELL) -> np.ndarray:
+    """From 0 to 1, more of them at the ends."""
+    ends = np.linspace(0.0, 1.0 / cells, max(_AT_ENDS, per_cell), endpoint=False)
+    between = np.linspace(1.0 / cells, 1.0 - 1.0 / cells, per_cell * (cells - 2) + 1)
+    return np.concatenate([ends, between, 1.0 - ends[::-1]])
+
+
+def with_points(x: np.ndarray, shares: np.ndarray, fine: np.ndarray, allowed: float) -> np.ndarray:
+    """Add the fine points at which a limit's share, shape (limits, K), is more than allowed, and their neighbours."""
+    beyond = (shares > allowed).any(axis=0)
+    # The neighbours too, to which a peak would move.
+    beyond[1:-1] |= beyond[:-2] | beyond[2:]
+    new = fine[beyond]
+    apart = 0.01 * float(np.diff(fine).min())
+    new = new[(np.abs(new[:, None] - x) > apart).all(axis=1)]
+    return np.sort(np.concatenate([x, new]))
+
+
+def repaced(timing: Timing, cells: int, pieces: int) -> Timing:
+    """Give a timing a course on which equal steps take about equal times, and more or fewer cells.
+
+    Parameters
+    ----------
+    timing : Timing
+        Of a `PacedPath`.
+    cells : int
+        Of b.
+    pieces : int
+        Of the new course's pace; few, so that it is smooth: the rest is left to b.
+    """
+    old = timing.problem.course
+    assert isinstance(old, PacedPath)
+    x = np.linspace(0.0, 1.0, _SAMPLES)
+    when = times(timing.pace, x)
+    place = old.nominal(x)
+    share = _BY_TIME * when / when[-1] + (1.0 - _BY_TIME) * x
+    course = old.repaced(x, share, pieces)
+    fine = np.linspace(0.0, 1.0, 5 * _SAMPLES)
+    there = course.nominal(fine)
+    if (np.diff(there) <= 0.0).any():  # a pace that goes back is none
+        course, there = old, old.nominal(fine)
+    at = np.interp(place, there, fine)
+    speed, nominal = old.nominal(x, nu=1) * np.sqrt(timing.pace(x)), course.nominal(at, nu=1)
+    weights = nominal / nominal.max()
+    known = weights > _NEAR_REST
+    wanted = (speed[known] / nominal[known]) ** 2
+    flat = constant_pace(cells, duration(timing.pace))
+    basis = sparse.csr_array(unit_splines(flat)(at[known]))
+    ties = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(len(flat.c) - 1, len(flat.c)))
+    # Least squares; what is not known, at the ends, is as its neighbours are.
+    matrix = basis.T @ sparse.diags_array(weights[known]) @ basis + _SMOOTHING * ties.T @ ties
+    pace = spline_of(np.maximum(spsolve(matrix.tocsc(), basis.T @ (weights[known] * wanted)), _SLOWEST * flat.c))
+    grid = points(cells)
+    before = np.interp(course.nominal(grid), place, x)
+    q = CubicSpline(timing.x, timing.turned.q.value)(before)
+    return evaluated(replace(timing.problem, course=course), pace, grid, q, timing.near(before))

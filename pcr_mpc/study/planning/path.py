@@ -1,0 +1,180 @@
+"""A path of the tip without its timing: a spline that can be differentiated four times."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.interpolate import BSpline
+from scipy.sparse.linalg import splu
+
+from ...errors import ModelError, checked_array
+from ...frozen import Frozen
+from ...loop.trajectory import Trajectory, sampled
+
+_DEGREE = 5  # four continuous derivatives: a motor's acceleration holds the fourth
+_SAMPLES = 8001  # of the motion whose path is taken
+_FEWEST, _MOST = 8, 1024  # pieces of the spline
+_SPARE = 0.1  # of the tolerance, which a plain fit may use
+_PENALTIES, _BISECTIONS = (1e-30, 1.0), 24
+_STILL = 1e-9  # of the path's length: a step between samples that is none
+
+
+@dataclass(frozen=True, eq=False)
+class TipPath(Frozen):
+    """Where the tip is to go, whenever.
+
+    Attributes
+    ----------
+    spline : BSpline
+        Position [m] by the length from the start [m]; of degree 5.
+    length : float
+        [m].
+    deviation : float
+        Greatest distance from what it was made of [m].
+    """
+
+    spline: BSpline
+    length: float
+    deviation: float
+
+    def derivatives(self, s: np.ndarray) -> np.ndarray:
+        """Position and its first four derivatives by s, shape (5, len(s), 2)."""
+        s = np.clip(s, 0.0, self.length)
+        return np.stack([self.spline(s, nu=order) for order in range(5)])
+
+
+def path_of(trajectory: Trajectory, duration: float, tolerance: float) -> TipPath:
+    """Take the path of a motion, and leave its timing and its rests.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    duration : float
+        [s].
+    tolerance : float
+        Greatest distance between the motion's path and its spline [m].
+
+    Raises
+    ------
+    ModelError
+        The tip does not move, or the path has a corner.
+    """
+    return path_through(sampled(trajectory, np.linspace(0.0, duration, _SAMPLES))[:, 0], tolerance)
+
+
+def path_through(points: np.ndarray, tolerance: float) -> TipPath:
+    """Fit a path to points that lie close together; see `path_of`.
+
+    Parameters
+    ----------
+    points : array_like, shape (K, 2)
+        [m].
+    tolerance : float
+        [m].
+    """
+    points = checked_array("points", points, (len(points), 2))
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    if not steps.sum() > tolerance:
+        raise ModelError(
+            f"the path is {1e3 * steps.sum():.3g} mm long, and has nothing to plan; give one that moves the tip by "
+            f"more than {1e3 * tolerance:.3g} mm",
+            key="reference",
+        )
+    moving = np.concatenate([[True], steps > _STILL * steps.sum()])
+    points = points[moving]
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    spline, away = _smoothest(s, points, tolerance)
+    at = int(away.argmax())
+    if away[at] <= tolerance:
+        return TipPath(spline, float(s[-1]), float(away[at]))
+    raise ModelError(
+        f"the path has a corner: its smooth spline is still {1e3 * away[at]:.3g} mm away at p = {points[at]} m, "
+        f"{1e3 * s[at]:.4g} mm along, where {1e3 * tolerance:.3g} mm are allowed; round the corner, or allow more",
+        key="reference",
+        deviation=float(away[at]),
+        s=float(s[at]),
+    )
+
+
+def _smoothest(s: np.ndarray, points: np.ndarray, tolerance: float) -> tuple[BSpline, np.ndarray]:
+    """Spline of least fourth derivative that stays within the tolerance of points, and its distances from them.
+
+    A change of a motor's rate holds that derivative: what is left of the tolerance is used to make it small.
+    """
+    pieces = _FEWEST
+    while True:
+        fit = _Fit(s, points, np.linspace(0.0, s[-1], pieces + 1))
+        spline, away = fit(0.0)
+        if away.max() <= _SPARE * tolerance or 2 * pieces > min(_MOST, len(s) // 4):
+            break
+        pieces *= 2
+    low, high = _PENALTIES
+    for _ in range(_BISECTIONS if away.max() <= tolerance else 0):
+        middle = math.sqrt(low * high)
+        smoother, further = fit(middle)
+        if further.max() <= tolerance:
+            low, spline, away = middle, smoother, further
+        else:
+            high = middle
+    return spline, away
+
+
+class _Fit:
+    """Least squares to points, with a penalty on differences of fourth order; the ends are kept.
+
+    Parameters
+    ----------
+    s : ndarray, shape (K,)
+    points : ndarray, shape (K, 2)
+    breaks : ndarray
+        Ends of the spline's pieces.
+    """
+
+    def __init__(self, s: np.ndarray, points: np.ndarray, breaks: np.ndarray) -> None:
+        self._s, self._points = s, points
+        self._knots = np.concatenate([[breaks[0]] * _DEGREE, breaks, [breaks[-1]] * _DEGREE])
+        self._design = BSpline.design_matrix(s, self._knots, _DEGREE).tocsc()
+        count = self._design.shape[1]
+        self._inner = self._design[:, 1:-1]
+        self._ends = np.stack([points[0], points[-1]])
+        # Samples may crowd where the motion was slow: each counts for the length that it stands for.
+        self._weights = sparse.diags_array(np.gradient(s) / s[-1])
+        # Fourth derivatives where pieces meet; between, they are linear.
+        units = BSpline(self._knots, np.eye(count), _DEGREE)
+        bend = sparse.csc_array(units(breaks, nu=4) * s[-1] ** 4 / len(breaks))
+        self._bend, self._bend_ends = bend[:, 1:-1], bend[:, [0, count - 1]]
+
+    def __call__(self, penalty: float) -> tuple[BSpline, np.ndarray]:
+        """Spline, and its distances from the points [m]."""
+        rest = self._points - self._design[:, [0, self._design.shape[1] - 1]] @ self._ends
+        matrix = self._inner.T @ self._weights @ self._inner + penalty * self._bend.T @ self._bend
+        right = self._inner.T @ (self._weights @ rest) - penalty * (self._bend.T @ (self._bend_ends @ self._ends))
+        solved = splu(matrix.tocsc()).solve(np.ascontiguousarray(right))
+        spline = BSpline(self._knots, np.concatenate([self._ends[:1], solved, self._ends[1:]]), _DEGREE)
+        return spline, np.linalg.norm(spline(self._s) - self._points, axis=1)
+
+
+def fitted(x: np.ndarray, y: np.ndarray, breaks: np.ndarray, degree: int, flat: int = 1) -> BSpline:
+    """Least-squares spline through the first and the last point, whose first ``flat`` coefficients are alike at each end.
+
+    Parameters
+    ----------
+    x : ndarray, shape (K,)
+    y : ndarray, shape (K, d)
+    breaks : ndarray
+        Ends of its pieces.
+    degree, flat : int
+        With flat = 4 three derivatives vanish at both ends.
+    """
+    knots = np.concatenate([[breaks[0]] * degree, breaks, [breaks[-1]] * degree])
+    design = BSpline.design_matrix(x, knots, degree).tocsc()
+    count = design.shape[1]
+    held = np.concatenate([np.repeat(y[:1], flat, axis=0), np.repeat(y[-1:], flat, axis=0)])
+    ends = [*range(flat), *range(count - flat, count)]
+    inner = design[:, flat : count - flat]
+    rest = y - design[:, ends] @ held
+    solved = splu((inner.T @ inner).tocsc()).solve(np.asarray(inner.T @ rest))
+    return BSpline(knots, np.concatenate([held[:flat], solved, held[flat:]]), degree)

@@ -1,0 +1,290 @@
+"""Plan the fastest motion along a scene's path that its robot can make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from tqdm import tqdm
+
+from ...errors import ConvergenceError, InfeasibleError, ModelError, PCRError, checked_number
+from ...loop.scene import Scene
+from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.free_tip import inverse_statics
+from .course import PacedPath, paced
+from .fastest import Problem, Timing, evaluated, faster
+from .limits import PlanLimits
+from .meshing import FINE, PER_CELL, points, repaced, with_points
+from .motion import Carrier
+from .pace import cells_of, constant_pace, spline_of, times
+from .path import TipPath, path_of
+from .timed_path import TimedPath
+
+_ROUGH_CELLS = 40
+_CELL = 8e-3  # s
+_FEWEST, _MOST = 80, 240  # cells
+_CELLS_PER_PIECE = 5
+_STATICS = 60  # poses that are found one by one
+_REST = 1e-3  # of the first guess's pace: so slow that motion asks for no force
+# Of one over the duration, with which the shares of some limits grow.
+_POWERS = {"change of rate": 3.0, "tip acceleration": 2.0, "tip jerk": 3.0, "motor rate": 2.0, "tip speed": 1.0}
+_TRIALS = 40
+_ITERATIONS = (40, 12, 6)
+_GAINS = (5e-3, 3e-4)  # of the duration, that are none: roughly, and in the end
+_ALLOWED = 1.0 - 2e-4  # share of the limits that is used, so that they are kept between the points too
+_EXCESS = 5e-4  # over 1, on the fine grid, at which no more points are added
+_LARGEST_EXCESS = 1e-3
+_ROUNDS = 8
+
+
+def plan_timing(
+    scene: Scene,
+    *,
+    limits: PlanLimits | None = None,
+    tolerance: float = 5e-5,
+    cells: int | None = None,
+    progress: bool = False,
+) -> TimedPath:
+    """Time-optimal timing of the path of a scene's reference.
+
+    The path is a spline of the tip, its timing that of the reference no more. Motor angles follow from inverse
+    statics with the force that the motion takes, F = m (g - a) - c v: rates hold the path's third derivative in time,
+    their change the fourth. The tip starts and ends at rest, with continuous acceleration and jerk.
+
+    Parameters
+    ----------
+    scene : Scene
+        With a reference; of its timing nothing is kept.
+    limits : PlanLimits, optional
+        None: those of the scene.
+    tolerance : float
+        Greatest distance between the reference's path and the planned one [m].
+    cells : int, optional
+        Pieces of the timing. None: of 8 ms each.
+    progress : bool
+        Show a bar on stderr.
+
+    Returns
+    -------
+    TimedPath
+
+    Raises
+    ------
+    ModelError
+        The scene has no path to plan, or one with a corner.
+    UnreachableError, UnstableError, ConvergenceError
+        The robot cannot rest at some point of the path; the message says where.
+    InfeasibleError
+        At rest on the path it would exceed a limit already; the message says which, where and by how much.
+
+    Notes
+    -----
+    The rods are without mass, as in the paper. A force on the tip that the scene has and its controller does not know
+    is not planned for. With more motors than two the angles are those of least motion.
+
+    References
+    ----------
+    .. [1] J. Bobrow, S. Dubowsky, J. Gibson, "Time-optimal control of robotic manipulators along specified paths",
+       International Journal of Robotics Research 4 (1985).
+    .. [2] D. Verscheure et al., "Time-optimal path tracking for robots: a convex optimization approach", IEEE
+       Transactions on Automatic Control 54 (2009): b and its slope as unknowns.
+    """
+    if scene.trajectory is None:
+        raise ModelError(f"{scene.name}: has no reference, and so no path to plan", key="reference")
+    checked_number("tolerance", tolerance, above=0.0)
+    limits = PlanLimits.of_scene(scene) if limits is None else limits
+    own = getattr(scene.trajectory, "duration", math.inf)
+    span = own if math.isfinite(own) else scene.duration
+    path = path_of(scene.trajectory, span, tolerance)
+    with tqdm(disable=not progress, unit=" iterations", desc="planning", leave=False) as bar:
+
+        def told(seconds: float) -> None:
+            bar.set_postfix_str(f"{seconds:.4f} s")
+            bar.update()
+
+        _require_region(scene, path)
+        problem = Problem(paced(path), scene.start(), carrier_of(scene, span), limits)
+        timing = faster(_started(problem, path), most=_ITERATIONS[0], tolerance=_GAINS[0], told=told)
+        wanted = cells or int(np.clip(math.ceil(timing.duration / _CELL), _FEWEST, _MOST))
+        timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
+        timing = faster(timing, most=_ITERATIONS[1], trust=0.3, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
+        timing, fine = refined(timing, told)
+    return _result(scene.name, timing, fine, path.deviation, bar.n)
+
+
+def carrier_of(scene: Scene, span: float) -> Carrier:
+    """What the tip is on its way, with the payload that it carries while it moves."""
+    carried = np.zeros(1)
+    if scene.payload is not None:
+        assert scene.trajectory is not None
+        t = np.linspace(0.0, span, 2001)
+        moving = np.linalg.norm(scene.trajectory(t)[:, 1], axis=1) > 0.0
+        carried = np.unique(scene.carried(t[moving]))
+        if len(carried) != 1:
+            raise ModelError(
+                f"{scene.name}: the tip picks up or puts down {scene.payload.mass:g} kg while it moves, and when that is "
+                "depends on the plan; plan the ways before and after it as scenes of their own",
+                key="payload",
+            )
+    mass = scene.robot.tip_mass + float(carried[0])
+    return Carrier(mass, scene.robot.drag, mass * np.array(scene.robot.gravity))
+
+
+def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tuple[Timing, Timing]:
+    """Add points where limits are exceeded between the points, until they are kept on a grid ten times as fine.
+
+    Returns
+    -------
+    timing, fine : Timing
+        At the points where its limits were kept, and on the fine grid.
+
+    Raises
+    ------
+    ConvergenceError
+        They are not kept to a thousandth.
+    """
+    between = points(cells_of(timing.pace), FINE)
+    fine = timing.at(between)
+    for _ in range(_ROUNDS):
+        if fine.worst <= 1.0 + _EXCESS:
+            return timing, fine
+        x = with_points(timing.x, fine.shares, between, _ALLOWED)
+        timing = faster(timing.at(x), most=_ITERATIONS[2], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
+        fine = timing.at(between)
+    if fine.worst > 1.0 + _LARGEST_EXCESS:
+        limit, at = np.unravel_index(int(fine.shares.argmax()), fine.shares.shape)
+        raise ConvergenceError(
+            f"the plan still exceeds the limit on {fine.uses[limit].limit} by {100 * (fine.worst - 1):.3g} % at "
+            f"{times(fine.pace, between)[at]:.4f} s after {_ROUNDS} refinements; take more cells than "
+            f"{cells_of(fine.pace)}",
+            residual=fine.worst - 1.0,
+            iterations=_ROUNDS,
+            last=fine.pace.c,
+        )
+    return timing, fine
+
+
+def _require_region(scene: Scene, path: TipPath) -> None:
+    """Raise if the path leaves the scene's region, in whatever time."""
+    s = np.linspace(0.0, path.length, 10 * _STATICS + 1)
+    p = path.derivatives(s)[0]
+    if scene.pose_limits.tip_lower is not None and scene.pose_limits.tip_upper is not None:
+        low, high = np.array(scene.pose_limits.tip_lower), np.array(scene.pose_limits.tip_upper)
+        beyond = np.maximum(low - p, p - high).max(axis=1)
+        at = int(beyond.argmax())
+        if beyond[at] > 0.0:
+            raise InfeasibleError(
+                f"{_where(s[at], p[at])} is {1e3 * beyond[at]:.3g} mm outside the tip's region, from {low} to {high} m; "
+                "move the path, or widen the region",
+                status="outside",
+                limit="tip region",
+                s=float(s[at]),
+            )
+    for length, at_point in zip(s, p, strict=True):
+        try:
+            scene.robot.require_reachable(at_point)
+        except PCRError as error:
+            raise type(error)(f"{_where(length, at_point)}: {error}", **error.details, s=float(length)) from None
+
+
+def _where(s: float, p: np.ndarray) -> str:
+    return f"the path at {1e3 * s:.4g} mm from its start, p = ({p[0]:.6g}, {p[1]:.6g}) m,"
+
+
+def _started(problem: Problem, path: TipPath) -> Timing:
+    """A pace that the robot can keep."""
+    x = points(_ROUGH_CELLS, 2)
+    q = _resting(problem, path, x)
+    acceleration = 5.0 * problem.pose.robot.force_scale / problem.carrier.mass
+    # The polynomial of degree 7 has a largest acceleration of 7.5 length / duration^2.
+    seconds = math.sqrt(7.5 * path.length / acceleration)
+    still = evaluated(problem, constant_pace(_ROUGH_CELLS, seconds / _REST), x, q)
+    _require_rest(still, path)
+    found: Timing | None = None
+    for _ in range(_TRIALS):
+        try:
+            found = evaluated(problem, constant_pace(_ROUGH_CELLS, seconds), x, still.turned.q.value, still.turned.poses)
+        except PCRError:
+            seconds *= 2.0
+            continue
+        if found.worst <= 1.0:
+            return found
+        shares = dict(zip((use.limit for use in found.uses), found.shares.max(axis=1), strict=True))
+        seconds *= max(1.1, *(1.05 * shares[kind] ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares))
+    raise ConvergenceError(
+        f"no pace was found at which the robot keeps its limits on this path: in {seconds:.3g} s it would still use "
+        f"{found.worst if found else math.inf:.3g} times what is allowed; is a limit almost reached at rest?",
+        residual=found.worst if found else math.inf,
+        iterations=_TRIALS,
+        last=seconds,
+    )
+
+
+def _resting(problem: Problem, path: TipPath, x: np.ndarray) -> np.ndarray:
+    """Motor angles that hold the tip on the path at the points x."""
+    s = np.linspace(0.0, path.length, _STATICS)
+    p = path.derivatives(s)[0]
+    pose: Equilibrium = problem.pose
+    payload = problem.carrier.weight - pose.robot.tip_weight
+    found = []
+    for length, tip in zip(s, p, strict=True):
+        try:
+            pose = inverse_statics(pose.robot, tip, payload, guess=pose)
+        except PCRError as error:
+            raise type(error)(f"{_where(length, tip)}: {error}", **error.details, s=float(length)) from None
+        found.append(pose.q)
+    course = problem.course
+    assert isinstance(course, PacedPath)
+    return np.asarray(CubicSpline(s, np.array(found))(np.clip(course.nominal(x), 0.0, path.length)))
+
+
+def _require_rest(still: Timing, path: TipPath) -> None:
+    """Raise if a limit is exceeded where the tip stands still."""
+    shares = still.shares
+    if shares.max() <= 1.0:
+        return
+    limit, at = np.unravel_index(int(shares.argmax()), shares.shape)
+    kind, robot = still.uses[limit].limit, still.problem.pose.robot
+    value = {
+        "motor torque": f"takes {np.abs(still.turned.torque.value[at]).max():.4g} N m, where "
+        f"{still.problem.limits.torque:.4g} N m are allowed",
+        "motor angle": f"needs motor angles of {np.array2string(still.turned.q.value[at], precision=4)} rad, where "
+        f"the stops are {robot.angle_limits.tolist()} rad",
+        "stiffness": f"leaves a stiffness of {still.problem.limits.stiffness / shares[limit, at]:.4g} N/m, where "
+        f"{still.problem.limits.stiffness:.4g} N/m are to be kept",
+        "rod margin": f"leaves a rod margin of {1 - shares[limit, at] * (1 - still.problem.limits.rod_margin):.4g}, where "
+        f"{still.problem.limits.rod_margin:.4g} is to be kept",
+    }.get(kind, f"uses {shares[limit, at]:.4g} times what is allowed")
+    p = still.moved.path[0].value[at]
+    s = float(still.problem.course.nominal(still.x[at]))  # type: ignore[attr-defined]
+    raise InfeasibleError(
+        f"{_where(s, p)} cannot be kept at any speed: to rest there {value} ({kind}); move the path, or allow more",
+        status="infeasible at rest",
+        limit=kind,
+        share=float(shares[limit, at]),
+        s=s,
+    )
+
+
+def _result(name: str, timing: Timing, fine: Timing, deviation: float, iterations: int) -> TimedPath:
+    moved, turned = fine.moved, fine.turned
+    steps = np.linalg.norm(np.diff(moved.path[0].value, axis=0), axis=1)
+    return TimedPath(
+        name,
+        timing.problem.course,
+        spline_of(timing.pace.c),
+        timing.problem.limits,
+        deviation,
+        len(timing.x),
+        t=times(fine.pace, fine.x),
+        s=np.concatenate([[0.0], np.cumsum(steps)]),
+        motion=np.stack([moved.path[0].value, moved.velocity.value, moved.acceleration.value], axis=1),
+        q=turned.q.value.copy(),
+        rates=turned.rate.value.copy(),
+        kinds=tuple(use.limit for use in fine.uses),
+        shares=fine.shares,
+        iterations=iterations,
+    )
+

@@ -1,0 +1,114 @@
+"""A planned motion: where the tip is when, and what that asks of the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from ...frozen import Frozen
+from .course import Course
+from .limits import PlanLimits
+from .pace import duration, places
+
+ACTIVE = 0.99  # share of a limit from which on it acts
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPath(Frozen):
+    """A path with its timing, at rest before and after; a `Trajectory`.
+
+    Attributes
+    ----------
+    name : str
+        Of the scene.
+    course : Course
+    pace : BSpline
+    limits : PlanLimits
+    deviation : float
+        Greatest distance of the path from the one that was given [m].
+    grid : int
+        Points at which limits were kept.
+    t : ndarray, shape (K,)
+        Times at which limits were checked: ten times as many [s].
+    s : ndarray, shape (K,)
+        Length from the start [m].
+    motion : ndarray, shape (K, 3, 2)
+        Position [m], velocity [m/s] and acceleration [m/s^2] there.
+    q, rates : ndarray, shape (K, n)
+        Motor angles [rad] and rates [rad/s] there.
+    kinds : tuple of str
+        The limits.
+    shares : ndarray, shape (limits, K)
+        Largest share of each that is used: 1 is all of it.
+    iterations : int
+    """
+
+    name: str
+    course: Course
+    pace: BSpline
+    limits: PlanLimits
+    deviation: float
+    grid: int
+    t: np.ndarray
+    s: np.ndarray
+    motion: np.ndarray
+    q: np.ndarray
+    rates: np.ndarray
+    kinds: tuple[str, ...]
+    shares: np.ndarray
+    iterations: int
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return duration(self.pace)
+
+    @property
+    def excess(self) -> float:
+        """By what share of it the worst limit is exceeded on the fine grid; negative: what is left."""
+        return float(self.shares.max()) - 1.0
+
+    @property
+    def acting(self) -> np.ndarray:
+        """Index of the limit that acts at each time, shape (K,); -1 where none does."""
+        return np.where(self.shares.max(axis=0) >= ACTIVE, self.shares.argmax(axis=0), -1)
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        """Position [m], velocity [m/s] and acceleration [m/s^2] at times t, shape (len(t), 3, 2)."""
+        t = np.asarray(t, dtype=float)
+        x = places(self.pace, t)
+        p, p1, p2 = self.course(x)[:3]
+        b, b1 = self.pace(x)[:, None], self.pace(x, nu=1)[:, None]
+        samples = np.stack([p, p1 * np.sqrt(b), p2 * b + p1 * b1 / 2.0], axis=1)
+        samples[(t < 0.0) | (t > self.duration), 1:] = 0.0
+        return samples
+
+    def summary(self) -> dict[str, Any]:
+        """Figures for a table and for machines."""
+        held = {kind: getattr(self.limits, kind.replace(" ", "_"), None) for kind in self.kinds}
+        weights = np.gradient(self.t) / self.duration
+        rows = [
+            {
+                "limit": kind,
+                "value": held[kind],
+                "largest_share": float(share.max()),
+                "at_s": float(self.t[share.argmax()]),
+                "acts_share": float(weights[self.acting == i].sum()),
+            }
+            for i, (kind, share) in enumerate(zip(self.kinds, self.shares, strict=True))
+        ]
+        return {
+            "scene": self.name,
+            "duration_s": self.duration,
+            "length_mm": 1e3 * float(self.s[-1]),
+            "deviation_mm": 1e3 * self.deviation,
+            "top_speed_m_s": float(np.linalg.norm(self.motion[:, 1], axis=1).max()),
+            "limits": rows,
+            "grid": self.grid,
+            "checked": len(self.t),
+            "largest_excess": self.excess,
+            "iterations": self.iterations,
+        }
