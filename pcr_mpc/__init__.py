@@ -52,6 +52,9 @@ if TYPE_CHECKING:
     from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
     from .report.tables import equilibria_table, equilibrium_table, summary_table
     from .study.episodes import Spread, run_episode, simulate_episode
+    from .study.planning.limits import PlanLimits
+    from .study.planning.plan import plan_timing
+    from .study.planning.timed_path import TimedPath
 
 __all__ = [
     "MATERIALS",
@@ -77,6 +80,7 @@ __all__ = [
     "PCRError",
     "PickAndPlace",
     "Plan",
+    "PlanLimits",
     "Plant",
     "Polygon",
     "QuadraticProgram",
@@ -93,6 +97,7 @@ __all__ = [
     "Spread",
     "Stability",
     "Tabulated",
+    "TimedPath",
     "TrackingController",
     "Trajectory",
     "Tuning",
@@ -116,6 +121,7 @@ __all__ = [
     "load_scene",
     "load_tuning",
     "make_controller",
+    "plan_timing",
     "plot_equilibria",
     "plot_equilibrium",
     "plot_run",
@@ -175,6 +181,9 @@ _WHERE = {
     "report.plots": ("animate_run", "plot_equilibria", "plot_equilibrium", "plot_run"),
     "report.tables": ("equilibria_table", "equilibrium_table", "summary_table"),
     "study.episodes": ("Spread", "run_episode", "simulate_episode"),
+    "study.planning.limits": ("PlanLimits",),
+    "study.planning.plan": ("plan_timing",),
+    "study.planning.timed_path": ("TimedPath",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 

@@ -20,6 +20,7 @@ examples:
   pcr-mpc statics planar_pair --p 0.18 0.12 --equilibria           what else it could snap to
   pcr-mpc track lemniscate --plant mujoco               against another engine's robot
   pcr-mpc export planar_pair --p 0 0.25 --mode LR --out pair.xml   that robot as MJCF
+  pcr-mpc plan waypoints --out fast.csv                 that path as fast as the robot can
   pcr-mpc choose vertical                               what physics the scene needs, and why
   pcr-mpc identify lemniscate run.csv --out mine.toml   a robot's numbers from recorded motion
   pcr-mpc timing lemniscate                             step times against the real-time budgets
@@ -33,7 +34,7 @@ Where a file is wanted, a name is one of pcr-mpc models; a path, such as ./mine/
 LINKS = 40
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 # Least values of the options that are whole numbers.
-LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1}
+LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8}
 
 
 def tuning_or_class(text: str) -> Path | str:
@@ -120,6 +121,24 @@ def parser() -> argparse.ArgumentParser:
     mjcf.add_argument("--mode", help="working mode, a letter L or R per rod, such as LR")
     mjcf.add_argument("--links", type=int, default=LINKS, help=f"of each rod (default {LINKS})")
     mjcf.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file, such as planar_pair.xml")
+
+    plan = command(
+        "plan",
+        "cli_plan",
+        "plan",
+        "Time a scene's path anew, as fast as the robot can follow it; write it as a path to track, and draw it.",
+    )
+    plan.add_argument("scene", help="scene: a file, or a name of pcr-mpc models; its reference is the path")
+    plan.add_argument("--out", type=Path, metavar="FILE", help="path to write, for a reference of kind file "
+                      "(default results/plan/NAME.csv); the picture is beside it")  # fmt: skip
+    plan.add_argument("--tip-speed", type=float, metavar="V", help="largest speed of the tip [m/s] (default: none)")
+    plan.add_argument("--tip-acceleration", type=float, metavar="A",
+                      help="largest acceleration of the tip [m/s^2] (default: none)")  # fmt: skip
+    plan.add_argument("--tip-jerk", type=float, metavar="J", help="largest jerk of the tip [m/s^3] (default: none)")
+    plan.add_argument("--tolerance", type=float, default=0.05, metavar="D",
+                      help="distance by which the path may be smoothed [mm] (default 0.05)")  # fmt: skip
+    plan.add_argument("--cells", type=int, help="pieces of the timing (default: of 8 ms each, 80 to 240)")
+    plan.add_argument("--no-pictures", action="store_true", help="write the path only")
 
     choice = command(
         "choose",

@@ -96,10 +96,11 @@ def _each_from_its_own(
     robot: Robot, p: np.ndarray, q: np.ndarray, guess: Equilibria, way: Way, compiled: bool
 ) -> Equilibria:
     solver = solver_of(robot, way.method, way.shooting)
-    if guess.robot != robot or len(guess.p) != len(p) or guess.method != way.method or not isinstance(solver, RodSolver):
+    same = guess.robot == robot and guess.method == way.method and len(guess.p) == len(p)
+    if not same or not isinstance(solver, RodSolver):
         raise ValueError(
-            f"guess holds {len(guess.p)} poses of {guess.robot.name} by {guess.method}, expected {len(p)} of {robot.name} "
-            f"by {way.method}, and another method than single_shooting"
+            f"guess holds {len(guess.p)} poses of {guess.robot.name} by {guess.method}, expected {len(p)} of "
+            f"{robot.name} by {way.method}, and another method than single_shooting"
         )
     work = _Work(robot, p, q, way, compiled)
     work.from_records(solver, guess.records)

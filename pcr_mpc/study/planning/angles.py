@@ -74,9 +74,11 @@ def balanced(
     """
     robot = pose.robot
     allowed = tolerance * robot.force_scale
-    for step in range(_MOST_STEPS):
-        poses = None if near is None else solve_statics_batch(robot, p, q, guess=near)
-        if poses is None or not poses.solved.all():
+    steps = 0
+    while steps < _MOST_STEPS:
+        steps += 1
+        poses = solve_statics_batch(robot, p, q, guess=pose if near is None else near, along=near is None)
+        if near is not None and not poses.solved.all():
             poses = solve_statics_batch(robot, p, q, guess=pose, along=True)
         missed = force - poses.force
         size = np.linalg.norm(missed, axis=1)
@@ -93,7 +95,7 @@ def balanced(
         f"no motor angles were found at which the rods carry {force[row]} N at p = {p[row]} m: "
         f"{poses.reason[row] or f'{size[row]:.3g} N are missing after {_MOST_STEPS} steps'}",
         residual=float(size[row]),
-        iterations=step + 1,
+        iterations=steps,
         last=q[row],
         row=row,
     )
@@ -127,9 +129,7 @@ def angles(
     return Angles(q_lin, rate, acceleration, Linear(poses.motor_torque, dtau), poses, pose)
 
 
-def _along(
-    poses: Equilibria, p1: np.ndarray, q1: np.ndarray, levers: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _along(poses: Equilibria, p1: np.ndarray, q1: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of K and H at each pose where tip and motors move by p1 and q1: by differences, at the pose alone."""
     size = np.abs(np.concatenate([p1 / poses.robot.lengths.mean(), q1], axis=1)).max(axis=1)
     step = _STEP / np.maximum(size, _STEP)

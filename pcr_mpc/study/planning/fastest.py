@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -102,7 +103,12 @@ class Timing:
 
 
 def evaluated(
-    problem: Problem, pace: BSpline, x: np.ndarray, q: np.ndarray, near: Equilibria | None = None, tolerance: float = _NEAR
+    problem: Problem,
+    pace: BSpline,
+    x: np.ndarray,
+    q: np.ndarray,
+    near: Equilibria | None = None,
+    tolerance: float = _NEAR,
 ) -> Timing:
     """Evaluate a pace at the points x; errors, ``near`` and ``tolerance`` as `balanced`.
 
@@ -190,22 +196,22 @@ class _Program:
         self._gradient = np.concatenate([gradient, np.zeros(self._extra)])
         scale = sparse.diags_array(pace.c)
         none = sparse.csr_array((len(timing.x), self._extra))
-        self._basis = [
+        self._basis: list[Any] = [
             sparse.hstack([sparse.csr_array(unit(timing.x, nu=order)) @ scale, none]).tocsr()
             for order in range(ORDERS_OF_PACE)
         ]
         none = sparse.csr_array((len(timing.x), self._paces))
         self._basis += [sparse.hstack([none, part]).tocsr() for part in course.basis(timing.x)]
-        self._slopes = sparse.vstack(
-            [
-                sum(sparse.diags_array(slope) @ part for slope, part in zip(use.share.slope[:, i].T, self._basis, strict=True))
-                for use in timing.uses
-                for i in range(use.share.slope.shape[1])
-            ]
-        ).tocsr()  # fmt: skip
+        self._slopes: Any = sparse.vstack(
+            [self._row(use.share.slope[:, i]) for use in timing.uses for i in range(use.share.slope.shape[1])]
+        ).tocsr()
         self._reach = abs(self._slopes)
         self._both = np.concatenate([np.full(use.share.value.size, use.both) for use in timing.uses])
         self._beyond = self._excess(timing)
+
+    def _row(self, slope: np.ndarray) -> Any:
+        """Slopes of one quantity, by the unknowns."""
+        return sum(sparse.diags_array(by_own) @ part for by_own, part in zip(slope.T, self._basis, strict=True))
 
     def step(self, trust: float, tolerance: float) -> tuple[float, tuple[float, Timing] | None]:
         """Return the gain that is predicted, and what was gained and the timing that gains it; None: not enough."""
@@ -239,8 +245,8 @@ class _Program:
         # Only limits that the change can reach.
         reach = self._reach @ np.full(self._reach.shape[1], trust)
         low, high = self._both & (rest - reach < -self._allowed), rest + reach > self._allowed
-        rows = sparse.vstack([self._slopes[high], -self._slopes[low]])
-        rows = sparse.hstack([rows, np.full((rows.shape[0], 1), -1.0)]).tocsr()
+        rows: Any = sparse.vstack([self._slopes[high], -self._slopes[low]])
+        rows = sparse.hstack([rows, sparse.csr_array(np.full((rows.shape[0], 1), -1.0))]).tocsr()
         bounds = np.concatenate([self._allowed - rest[high], self._allowed + rest[low]])
         box = [(-trust / (1.0 + trust), trust)] * self._paces + [(-trust, trust)] * self._extra + [(0.0, None)]
         equal = self._timing.problem.course.held()
@@ -263,7 +269,8 @@ class _Program:
                 iterations=int(found.nit),
                 last=self._timing.pace.c,
             )
-        return found.x[:-1], float(found.x[-1])
+        x: Any = found.x
+        return x[:-1], float(x[-1])
 
     def _moved(self, change: np.ndarray) -> Timing | None:
         """Evaluate a change; None if the rods cannot do it."""

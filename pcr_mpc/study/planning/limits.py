@@ -17,6 +17,19 @@ from .angles import Angles
 from .linear import Linear
 from .motion import Motion
 
+# Of the limits, by their names; those on motor angles and on the tip's region are intervals.
+UNITS = {
+    "motor rate": "rad/s",
+    "change of rate": "rad/s^2",
+    "motor torque": "N m",
+    "motor angle": "rad",
+    "tip region": "m",
+    "tip speed": "m/s",
+    "tip acceleration": "m/s^2",
+    "tip jerk": "m/s^3",
+    "stiffness": "N/m",
+    "rod margin": "1",
+}
 _WATCHED = 0.8  # of a margin's limit, from which on its slope is computed
 _ANGLE = 1e-5  # by which motors are turned to see how margins change [rad]
 
@@ -54,9 +67,15 @@ class PlanLimits:
             check_numbers(self, {"rod_margin": {"maximum": 0.9}})
         check_numbers(self, {"stiffness": {"minimum": 0.0}})
 
+    def value(self, kind: str) -> float | None:
+        """Value of a limit by its name; None if it is an interval."""
+        names = {"motor rate": "rate", "change of rate": "acceleration", "motor torque": "torque"}
+        found: float | None = getattr(self, names.get(kind, kind.replace(" ", "_")), None)
+        return found
+
     @classmethod
-    def of_scene(cls, scene: Scene) -> PlanLimits:
-        """Those of a scene and its robot."""
+    def of_scene(cls, scene: Scene, **more: float) -> PlanLimits:
+        """Those of a scene and its robot, and more by name."""
         poses: PoseLimits = scene.pose_limits
         return cls(
             scene.robot.rate_limit,
@@ -64,6 +83,7 @@ class PlanLimits:
             scene.torque_limit,
             rod_margin=-math.inf if poses.rod_margin is None else poses.rod_margin,
             stiffness=poses.stiffness or 0.0,
+            **more,
         )
 
 
@@ -129,7 +149,8 @@ def _stiffness(least: float, turned: Angles) -> Use:
             change = (_turned(turned, i).dforce_dp - poses.dforce_dp) / _ANGLE
             slope[:, i] = np.einsum("mi,mij,mj->m", vector, change, vector)
     by_angle = -(share**2)[:, None] / least * slope
-    return Use("stiffness", Linear(share[:, None], np.einsum("mi,mid->md", by_angle, turned.q.slope)[:, None]), both=False)
+    by_own = np.einsum("mi,mid->md", by_angle, turned.q.slope)[:, None]
+    return Use("stiffness", Linear(share[:, None], by_own), both=False)
 
 
 def _rod_margin(least: float, turned: Angles) -> Use:
@@ -143,7 +164,7 @@ def _rod_margin(least: float, turned: Angles) -> Use:
 
 
 def loads(poses: Equilibria, exact_from: float) -> np.ndarray:
-    """Lambda over lambda_c of plain rods in closed form, shape (R, n); a little too much where it is less than given."""
+    """Lambda over lambda_c of plain rods in closed form, shape (R, n); too much where it is less than given."""
     robot = poses.robot
     load = robot.lengths * np.sqrt(np.linalg.norm(poses.rod_forces, axis=2) / robot.stiffnesses)
     critical = np.full(load.shape, LEAST_CRITICAL_LOAD)

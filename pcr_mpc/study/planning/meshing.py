@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -32,7 +33,7 @@ def points(cells: int, per_cell: int = PER_CELL) -> np.ndarray:
 
 def with_points(x: np.ndarray, shares: np.ndarray, fine: np.ndarray, allowed: float) -> np.ndarray:
     """Add the fine points at which a limit's share, shape (limits, K), is more than allowed, and their neighbours."""
-    beyond = (shares > allowed).any(axis=0)
+    beyond = np.asarray((shares > allowed).any(axis=0))
     # The neighbours too, to which a peak would move.
     beyond[1:-1] |= beyond[:-2] | beyond[2:]
     new = fine[beyond]
@@ -73,7 +74,7 @@ def repaced(timing: Timing, cells: int, pieces: int) -> Timing:
     basis = sparse.csr_array(unit_splines(flat)(at[known]))
     ties = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(len(flat.c) - 1, len(flat.c)))
     # Least squares; what is not known, at the ends, is as its neighbours are.
-    matrix = basis.T @ sparse.diags_array(weights[known]) @ basis + _SMOOTHING * ties.T @ ties
+    matrix: Any = basis.T @ sparse.diags_array(weights[known]) @ basis + _SMOOTHING * ties.T @ ties
     pace = spline_of(np.maximum(spsolve(matrix.tocsc(), basis.T @ (weights[known] * wanted)), _SLOWEST * flat.c))
     grid = points(cells)
     before = np.interp(course.nominal(grid), place, x)

@@ -84,9 +84,7 @@ def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, *, free: bool) 
         p3 * b + 1.5 * (p2 * b1) + 0.5 * (p1 * b2),
         p4 * b + 2.5 * (p3 * b1) + 2.0 * (p2 * b2) + 0.5 * (p1 * b3),
     )
-    f, f1, f2 = (
-        -carrier.mass * a - carrier.drag * v for a, v in zip(acceleration, speed, strict=True)
-    )
+    f, f1, f2 = (-carrier.mass * a - carrier.drag * v for a, v in zip(acceleration, speed, strict=True))
     force = Linear(f.value + carrier.weight, f.slope), f1, f2
     return Motion(theta, b, b1, speed[0], acceleration[0], acceleration[1] * theta, force, (p, p1, p2))
 

@@ -158,7 +158,7 @@ class _Fit:
 
 
 def fitted(x: np.ndarray, y: np.ndarray, breaks: np.ndarray, degree: int, flat: int = 1) -> BSpline:
-    """Least-squares spline through the first and the last point, whose first ``flat`` coefficients are alike at each end.
+    """Least-squares spline through the first and the last point, with ``flat`` coefficients alike at each end.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from ...plant.statics.free_tip import inverse_statics
 from .course import PacedPath, paced
 from .fastest import Problem, Timing, evaluated, faster
 from .limits import PlanLimits
-from .meshing import FINE, PER_CELL, points, repaced, with_points
+from .meshing import FINE, points, repaced, with_points
 from .motion import Carrier
 from .pace import cells_of, constant_pace, spline_of, times
 from .path import TipPath, path_of
@@ -98,9 +98,12 @@ def plan_timing(
     own = getattr(scene.trajectory, "duration", math.inf)
     span = own if math.isfinite(own) else scene.duration
     path = path_of(scene.trajectory, span, tolerance)
+    iterations = 0
     with tqdm(disable=not progress, unit=" iterations", desc="planning", leave=False) as bar:
 
         def told(seconds: float) -> None:
+            nonlocal iterations
+            iterations += 1
             bar.set_postfix_str(f"{seconds:.4f} s")
             bar.update()
 
@@ -111,7 +114,7 @@ def plan_timing(
         timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
         timing = faster(timing, most=_ITERATIONS[1], trust=0.3, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
         timing, fine = refined(timing, told)
-    return _result(scene.name, timing, fine, path.deviation, bar.n)
+    return _result(scene.name, timing, fine, path.deviation, iterations)
 
 
 def carrier_of(scene: Scene, span: float) -> Carrier:
@@ -124,8 +127,8 @@ def carrier_of(scene: Scene, span: float) -> Carrier:
         carried = np.unique(scene.carried(t[moving]))
         if len(carried) != 1:
             raise ModelError(
-                f"{scene.name}: the tip picks up or puts down {scene.payload.mass:g} kg while it moves, and when that is "
-                "depends on the plan; plan the ways before and after it as scenes of their own",
+                f"{scene.name}: the tip picks up or puts down {scene.payload.mass:g} kg while it moves, and when that "
+                "is depends on the plan; plan the ways before and after it as scenes of their own",
                 key="payload",
             )
     mass = scene.robot.tip_mass + float(carried[0])
@@ -176,8 +179,8 @@ def _require_region(scene: Scene, path: TipPath) -> None:
         at = int(beyond.argmax())
         if beyond[at] > 0.0:
             raise InfeasibleError(
-                f"{_where(s[at], p[at])} is {1e3 * beyond[at]:.3g} mm outside the tip's region, from {low} to {high} m; "
-                "move the path, or widen the region",
+                f"{_where(s[at], p[at])} is {1e3 * beyond[at]:.3g} mm outside the tip's region, from {low} to {high} "
+                "m; move the path, or widen the region",
                 status="outside",
                 limit="tip region",
                 s=float(s[at]),
@@ -203,16 +206,18 @@ def _started(problem: Problem, path: TipPath) -> Timing:
     still = evaluated(problem, constant_pace(_ROUGH_CELLS, seconds / _REST), x, q)
     _require_rest(still, path)
     found: Timing | None = None
+    resting = still.turned.q.value, still.turned.poses
     for _ in range(_TRIALS):
         try:
-            found = evaluated(problem, constant_pace(_ROUGH_CELLS, seconds), x, still.turned.q.value, still.turned.poses)
+            found = evaluated(problem, constant_pace(_ROUGH_CELLS, seconds), x, *resting)
         except PCRError:
             seconds *= 2.0
             continue
         if found.worst <= 1.0:
             return found
         shares = dict(zip((use.limit for use in found.uses), found.shares.max(axis=1), strict=True))
-        seconds *= max(1.1, *(1.05 * shares[kind] ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares))
+        slower = [1.05 * shares[kind] ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares]
+        seconds *= max(1.1, *slower)
     raise ConvergenceError(
         f"no pace was found at which the robot keeps its limits on this path: in {seconds:.3g} s it would still use "
         f"{found.worst if found else math.inf:.3g} times what is allowed; is a limit almost reached at rest?",
@@ -254,8 +259,8 @@ def _require_rest(still: Timing, path: TipPath) -> None:
         f"the stops are {robot.angle_limits.tolist()} rad",
         "stiffness": f"leaves a stiffness of {still.problem.limits.stiffness / shares[limit, at]:.4g} N/m, where "
         f"{still.problem.limits.stiffness:.4g} N/m are to be kept",
-        "rod margin": f"leaves a rod margin of {1 - shares[limit, at] * (1 - still.problem.limits.rod_margin):.4g}, where "
-        f"{still.problem.limits.rod_margin:.4g} is to be kept",
+        "rod margin": f"leaves a rod margin of {1 - shares[limit, at] * (1 - still.problem.limits.rod_margin):.4g}, "
+        f"where {still.problem.limits.rod_margin:.4g} is to be kept",
     }.get(kind, f"uses {shares[limit, at]:.4g} times what is allowed")
     p = still.moved.path[0].value[at]
     s = float(still.problem.course.nominal(still.x[at]))  # type: ignore[attr-defined]
@@ -287,4 +292,3 @@ def _result(name: str, timing: Timing, fine: Timing, deviation: float, iteration
         shares=fine.shares,
         iterations=iterations,
     )
-

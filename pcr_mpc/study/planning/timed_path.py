@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +11,12 @@ from scipy.interpolate import BSpline
 
 from ...frozen import Frozen
 from .course import Course
-from .limits import PlanLimits
+from .limits import UNITS, PlanLimits
 from .pace import duration, places
 
-ACTIVE = 0.99  # share of a limit from which on it acts
+ACTIVE = 0.95  # share of a limit from which on it acts
+_HEADER = "t_s,x_m,y_m,vx_m_s,vy_m_s,ax_m_s2,ay_m_s2"
+_ROW = 1e-3  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +89,26 @@ class TimedPath(Frozen):
         samples[(t < 0.0) | (t > self.duration), 1:] = 0.0
         return samples
 
+    def csv(self, step: float = _ROW) -> str:
+        """Table for ``[reference] kind = "file"``: time, position, velocity and acceleration, to all digits.
+
+        Parameters
+        ----------
+        step : float
+            Longest time from row to row [s].
+        """
+        t = np.linspace(0.0, self.duration, math.ceil(self.duration / step) + 1)
+        rows = np.column_stack([t, self(t).reshape(len(t), 6)])
+        return "\n".join([_HEADER, *(",".join(map(repr, row)) for row in rows.tolist())]) + "\n"
+
     def summary(self) -> dict[str, Any]:
         """Figures for a table and for machines."""
-        held = {kind: getattr(self.limits, kind.replace(" ", "_"), None) for kind in self.kinds}
         weights = np.gradient(self.t) / self.duration
         rows = [
             {
                 "limit": kind,
-                "value": held[kind],
+                "value": self.limits.value(kind),
+                "unit": UNITS[kind],
                 "largest_share": float(share.max()),
                 "at_s": float(self.t[share.argmax()]),
                 "acts_share": float(weights[self.acting == i].sum()),
