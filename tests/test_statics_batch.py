@@ -229,3 +229,22 @@ def test_rods_beyond_their_limit_are_told_after_a_warm_start_too(pair, method):
         batch = solve_statics_batch(pair, tips, angles, method=method, guess=guess, along=along)
         np.testing.assert_array_equal(batch.unstable, [[True, False]] * 2)
         assert not batch.stable.any()
+
+
+def test_many_guesses_are_gone_on_from_each_by_itself(pair, centre):
+    """In any order; what is too far for one step is left with a reason."""
+    p, q = loop(centre, 70)
+    start = solve_statics_batch(pair, p, q, guess=centre, along=True)
+    order = np.random.default_rng(0).permutation(70)
+    found = solve_statics_batch(pair, p[order], q[order] + 1e-3, guess=start.rows(order))
+    assert found.solved.all()
+    wanted = solve_statics_batch(pair, p, q + 1e-3, guess=centre, along=True)
+    for name in FIGURES:
+        assert getattr(found, name) == pytest.approx(getattr(wanted, name)[order], rel=1e-7, abs=1e-9), name
+    far = solve_statics_batch(
+        pair, centre.p + [[0.0, 0.0], [0.0, -0.2]], [centre.q] * 2, guess=start.rows(np.zeros(2, int))
+    )
+    assert far.solved.tolist() == [True, False]
+    assert "in one step" in far.reason[1]
+    with pytest.raises(ValueError, match="guess holds 70 poses"):
+        solve_statics_batch(pair, p[:3], q[:3], guess=start)

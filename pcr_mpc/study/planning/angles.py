@@ -85,7 +85,7 @@ def balanced(
         lost = np.flatnonzero(~np.isfinite(size))
         if lost.size:
             break
-        turn = np.einsum("mij,mj->mi", np.linalg.pinv(poses.dforce_dq), missed)
+        turn = np.einsum("mij,mj->mi", _levers(poses.dforce_dq), missed)
         if (size <= allowed).all():
             return poses, poses.q + turn
         q = q + turn * np.minimum(1.0, _LARGEST_STEP / np.maximum(np.abs(turn).max(axis=1, keepdims=True), 1e-300))
@@ -108,7 +108,7 @@ def angles(
     f, f1, f2 = moved.force
     p, p1, p2 = moved.path
     poses, q = balanced(pose, p.value, f.value, q, near, tolerance)
-    stiffness, levers = poses.dforce_dp, np.linalg.pinv(poses.dforce_dq)
+    stiffness, levers = poses.dforce_dp, _levers(poses.dforce_dq)
     # Along x: K P' + G q' = F', with H = G^+. The slopes: K dP + G dq = dF at every x.
     first = f1 - p1.through(stiffness)
     k1, h1 = _along(poses, p1.value, first.through(levers).value, levers)
@@ -129,13 +129,18 @@ def angles(
     return Angles(q_lin, rate, acceleration, Linear(poses.motor_torque, dtau), poses, pose)
 
 
+def _levers(coupling: np.ndarray) -> np.ndarray:
+    """H = G^+: the least turn of the motors by which the rods carry one more newton, shape (M, n, 2) [rad/N]."""
+    return np.linalg.inv(coupling) if coupling.shape[2] == 2 else np.linalg.pinv(coupling)
+
+
 def _along(poses: Equilibria, p1: np.ndarray, q1: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of K and H at each pose where tip and motors move by p1 and q1: by differences, at the pose alone."""
     size = np.abs(np.concatenate([p1 / poses.robot.lengths.mean(), q1], axis=1)).max(axis=1)
     step = _STEP / np.maximum(size, _STEP)
     there = solve_statics_batch(poses.robot, poses.p + step[:, None] * p1, poses.q + step[:, None] * q1, guess=poses)
     scale = 1.0 / step[:, None, None]
-    return scale * (there.dforce_dp - poses.dforce_dp), scale * (np.linalg.pinv(there.dforce_dq) - levers)
+    return scale * (there.dforce_dp - poses.dforce_dp), scale * (_levers(there.dforce_dq) - levers)
 
 
 def _derivative(x: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -26,8 +26,9 @@ class Course(Protocol):
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """P and its first four derivatives, shape (5, len(x), 2)."""
 
-    def basis(self, x: np.ndarray) -> list[Any]:
-        """How x, then y, of P and its four derivatives change with the unknowns: sparse, (len(x), unknowns) each."""
+    def basis(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which unknowns count at the points x, (len(x), j), and how x of P and its derivatives, then y, change with
+        them, (10, len(x), j)."""
 
     def held(self) -> Any | None:
         """Rows of the unknowns whose sums are to stay zero: sparse, (rows, unknowns); None if there are none."""
@@ -68,9 +69,9 @@ class PacedPath:
         """See `Course`."""
         return 0
 
-    def basis(self, x: np.ndarray) -> list[Any]:
+    def basis(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `Course`."""
-        return []
+        return np.empty((len(x), 0), dtype=int), np.empty((10, len(x), 0))
 
     def held(self) -> Any | None:
         """See `Course`."""
@@ -92,7 +93,7 @@ class PacedPath:
         cells : int
             Pieces of the new pace's spline.
         """
-        nominal = fitted(share, self.nominal(x)[:, None], np.linspace(0.0, 1.0, cells + 1), 5, flat=4)
+        nominal = fitted(share, self.nominal(x)[:, None], np.linspace(0.0, 1.0, cells + 1), 7, flat=4)
         return PacedPath(self.path, BSpline(nominal.t, nominal.c[:, 0], nominal.k))
 
 

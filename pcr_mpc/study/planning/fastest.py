@@ -24,7 +24,7 @@ from .angles import Angles, angles
 from .course import Course
 from .limits import PlanLimits, Use, uses
 from .motion import ORDERS_OF_PACE, Carrier, Motion, motion
-from .pace import duration, quadrature, unit_splines
+from .pace import duration, local_basis, quadrature, unit_splines
 
 _PENALTY = 1.0  # of log duration for exceeding a limit by all of it; slower motion buys it back for less
 _CORRECTIONS = 3
@@ -188,30 +188,32 @@ class _Program:
     def __init__(self, timing: Timing, allowed: float) -> None:
         self._timing, self._allowed = timing, allowed
         pace, course = timing.pace, timing.problem.course
-        unit = unit_splines(pace)
         x, weights = quadrature(pace)
-        self._paces, self._extra = len(pace.c), course.unknowns
+        paces = len(pace.c)
         # Unknowns: relative changes of the coefficients of b, and what the course has of its own.
-        gradient = -0.5 * (weights * pace(x) ** -1.5) @ unit(x) / timing.duration * pace.c
-        self._gradient = np.concatenate([gradient, np.zeros(self._extra)])
-        scale = sparse.diags_array(pace.c)
-        none = sparse.csr_array((len(timing.x), self._extra))
-        self._basis: list[Any] = [
-            sparse.hstack([sparse.csr_array(unit(timing.x, nu=order)) @ scale, none]).tocsr()
-            for order in range(ORDERS_OF_PACE)
-        ]
-        none = sparse.csr_array((len(timing.x), self._paces))
-        self._basis += [sparse.hstack([none, part]).tocsr() for part in course.basis(timing.x)]
-        self._slopes: Any = sparse.vstack(
-            [self._row(use.share.slope[:, i]) for use in timing.uses for i in range(use.share.slope.shape[1])]
-        ).tocsr()
-        self._reach = abs(self._slopes)
+        gradient = -0.5 * (weights * pace(x) ** -1.5) @ unit_splines(pace)(x) / timing.duration * pace.c
+        self._gradient = np.concatenate([gradient, np.zeros(course.unknowns)])
+        self._paces = paces
+        # Few of them count at each point: which, and how b, P and their derivatives change with them.
+        columns, values = local_basis(pace, timing.x, ORDERS_OF_PACE)
+        self._parts = [(columns, values * pace.c[columns])]
+        if course.unknowns:
+            columns, values = course.basis(timing.x)
+            self._parts.append((paces + columns, values))
+        self._columns = np.concatenate([columns for columns, _ in self._parts], axis=1)
+        shares = [use.share.slope[:, i] for use in timing.uses for i in range(use.share.slope.shape[1])]
+        self._slopes = np.concatenate([self._by_unknowns(slope) for slope in shares])
+        self._where = np.tile(self._columns, (len(shares), 1))
         self._both = np.concatenate([np.full(use.share.value.size, use.both) for use in timing.uses])
         self._beyond = self._excess(timing)
 
-    def _row(self, slope: np.ndarray) -> Any:
-        """Slopes of one quantity, by the unknowns."""
-        return sum(sparse.diags_array(by_own) @ part for by_own, part in zip(slope.T, self._basis, strict=True))
+    def _by_unknowns(self, slope: np.ndarray) -> np.ndarray:
+        """From slopes by b, P and their derivatives, shape (M, D), to slopes by the unknowns that count."""
+        blocks, first = [], 0
+        for _, values in self._parts:
+            blocks.append(np.einsum("mo,omj->mj", slope[:, first : first + len(values)], values))
+            first += len(values)
+        return np.concatenate(blocks, axis=1)
 
     def step(self, trust: float, tolerance: float) -> tuple[float, tuple[float, Timing] | None]:
         """Return the gain that is predicted, and what was gained and the timing that gains it; None: not enough."""
@@ -234,7 +236,7 @@ class _Program:
             if gain > _ENOUGH * predicted:
                 break
             # What the slopes do not know is taken for the same in the next try.
-            rest = _stacked(trial) - self._slopes @ change
+            rest = _stacked(trial) - (self._slopes * change[self._where]).sum(axis=1)
         return predicted, best if best is not None and best[0] > _LEAST_GAIN * predicted else None
 
     def _excess(self, timing: Timing) -> float:
@@ -243,23 +245,29 @@ class _Program:
     def _solved(self, rest: np.ndarray, trust: float) -> tuple[np.ndarray, float]:
         """Changes of the unknowns, and by how much limits are exceeded then, if shares are rest + slopes @ change."""
         # Only limits that the change can reach.
-        reach = self._reach @ np.full(self._reach.shape[1], trust)
-        low, high = self._both & (rest - reach < -self._allowed), rest + reach > self._allowed
-        rows: Any = sparse.vstack([self._slopes[high], -self._slopes[low]])
-        rows = sparse.hstack([rows, sparse.csr_array(np.full((rows.shape[0], 1), -1.0))]).tocsr()
+        reach = trust * np.abs(self._slopes).sum(axis=1)
+        high, low = rest + reach > self._allowed, self._both & (rest - reach < -self._allowed)
+        count = len(self._gradient)
+        slopes = np.concatenate([self._slopes[high], -self._slopes[low]])
+        where = np.concatenate([self._where[high], self._where[low]])
+        # The last column is the excess.
+        entries = np.column_stack([slopes, np.full(len(slopes), -1.0)])
+        places = np.column_stack([where, np.full(len(where), count)])
+        ends = entries.shape[1] * np.arange(len(entries) + 1)
+        rows = sparse.csr_array((entries.ravel(), places.ravel(), ends), shape=(len(entries), count + 1))
         bounds = np.concatenate([self._allowed - rest[high], self._allowed + rest[low]])
-        box = [(-trust / (1.0 + trust), trust)] * self._paces + [(-trust, trust)] * self._extra + [(0.0, None)]
-        equal = self._timing.problem.course.held()
-        equal = None if equal is None else sparse.hstack(
-            [sparse.csr_array((equal.shape[0], self._paces)), equal, sparse.csr_array((equal.shape[0], 1))]
-        ).tocsr()  # fmt: skip
-        found = linprog(
+        box = [(-trust / (1.0 + trust), trust)] * self._paces + [(-trust, trust)] * (count - self._paces)
+        held, equal = self._timing.problem.course.held(), None
+        if held is not None:
+            none = sparse.csr_array((held.shape[0], self._paces)), sparse.csr_array((held.shape[0], 1))
+            equal = sparse.hstack([none[0], held, none[1]]).tocsr()
+        found: Any = linprog(  # type: ignore[call-overload]  # its stubs know no sparse matrices
             np.append(self._gradient, _PENALTY),
             rows,
             bounds,
             equal,
             None if equal is None else np.zeros(equal.shape[0]),
-            bounds=box,
+            bounds=[*box, (0.0, None)],
             method="highs-ds",
         )
         if found.status != 0:
@@ -269,16 +277,15 @@ class _Program:
                 iterations=int(found.nit),
                 last=self._timing.pace.c,
             )
-        x: Any = found.x
-        return x[:-1], float(x[-1])
+        return found.x[:-1], float(found.x[-1])
 
     def _moved(self, change: np.ndarray) -> Timing | None:
         """Evaluate a change; None if the rods cannot do it."""
         old = self._timing
         pace = BSpline(old.pace.t, old.pace.c * (1.0 + change[: self._paces]), old.pace.k)
         problem = replace(old.problem, course=old.problem.course.moved(change[self._paces :]))
-        unknowns = np.stack([part @ change for part in self._basis])
-        q = old.turned.q.value + np.einsum("mkd,dm->mk", old.turned.q.slope, unknowns)
+        moves = np.concatenate([np.einsum("omj,mj->om", values, change[columns]) for columns, values in self._parts])
+        q = old.turned.q.value + np.einsum("mkd,dm->mk", old.turned.q.slope, moves)
         try:
             return evaluated(problem, pace, old.x, q, old.turned.poses)
         except PCRError:

@@ -15,7 +15,7 @@ from .fastest import Timing, evaluated
 from .pace import constant_pace, duration, spline_of, times, unit_splines
 
 PER_CELL = 3
-FINE = 10  # points to a cell where the result is checked
+FINE = 10 * PER_CELL  # points to a cell where the result is checked
 _AT_ENDS = 8  # in the first and the last cell: there the tip hardly moves, and b is free to do much
 _BY_TIME = 0.8  # of the new course goes by time, the rest as before
 _SAMPLES = 4001

@@ -32,6 +32,23 @@ def unit_splines(pace: BSpline) -> BSpline:
     return BSpline(pace.t, np.eye(len(pace.c)), pace.k)
 
 
+def local_basis(spline: BSpline, x: np.ndarray, orders: int) -> tuple[np.ndarray, np.ndarray]:
+    """Basis functions that are not zero at the points x, of a spline on equal pieces from 0 to 1.
+
+    Returns
+    -------
+    columns : ndarray of int, shape (len(x), degree + 1)
+        Their numbers.
+    values : ndarray, shape (orders, len(x), degree + 1)
+        Their derivatives, from the function itself on.
+    """
+    pieces = len(spline.c) - spline.k
+    first = np.clip((x * pieces).astype(int), 0, pieces - 1)
+    columns = first[:, None] + np.arange(spline.k + 1)
+    unit = unit_splines(spline)
+    return columns, np.stack([np.take_along_axis(unit(x, nu=order), columns, axis=1) for order in range(orders)])
+
+
 def quadrature(pace: BSpline) -> tuple[np.ndarray, np.ndarray]:
     """Gauss points and weights, _POINTS to a cell."""
     return _gauss(np.linspace(0.0, 1.0, cells_of(pace) + 1))

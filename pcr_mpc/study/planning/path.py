@@ -14,11 +14,11 @@ from ...errors import ModelError, checked_array
 from ...frozen import Frozen
 from ...loop.trajectory import Trajectory, sampled
 
-_DEGREE = 5  # four continuous derivatives: a motor's acceleration holds the fourth
+_DEGREE = 7  # a motor's acceleration holds the fourth derivative, which is to have no kinks
 _SAMPLES = 8001  # of the motion whose path is taken
 _FEWEST, _MOST = 8, 1024  # pieces of the spline
 _SPARE = 0.1  # of the tolerance, which a plain fit may use
-_PENALTIES, _BISECTIONS = (1e-30, 1.0), 24
+_PENALTIES, _BISECTIONS = (1e-30, 1e-8), 24
 _STILL = 1e-9  # of the path's length: a step between samples that is none
 
 
@@ -29,7 +29,7 @@ class TipPath(Frozen):
     Attributes
     ----------
     spline : BSpline
-        Position [m] by the length from the start [m]; of degree 5.
+        Position [m] by the length from the start [m]; of degree 7.
     length : float
         [m].
     deviation : float
@@ -84,7 +84,7 @@ def path_through(points: np.ndarray, tolerance: float) -> TipPath:
             key="reference",
         )
     moving = np.concatenate([[True], steps > _STILL * steps.sum()])
-    points = points[moving]
+    points = np.vstack([points[moving][:-1], points[-1]])
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     spline, away = _smoothest(s, points, tolerance)
     at = int(away.argmax())
@@ -142,9 +142,9 @@ class _Fit:
         self._ends = np.stack([points[0], points[-1]])
         # Samples may crowd where the motion was slow: each counts for the length that it stands for.
         self._weights = sparse.diags_array(np.gradient(s) / s[-1])
-        # Fourth derivatives where pieces meet; between, they are linear.
+        # Fourth derivatives, at more points than the spline has freedom.
         units = BSpline(self._knots, np.eye(count), _DEGREE)
-        bend = sparse.csc_array(units(breaks, nu=4) * s[-1] ** 4 / len(breaks))
+        bend = sparse.csc_array(units(np.linspace(0.0, s[-1], 2 * len(breaks)), nu=4) * s[-1] ** 4 / len(breaks))
         self._bend, self._bend_ends = bend[:, 1:-1], bend[:, [0, count - 1]]
 
     def __call__(self, penalty: float) -> tuple[BSpline, np.ndarray]:

@@ -23,20 +23,20 @@ from .path import TipPath, path_of
 from .timed_path import TimedPath
 
 _ROUGH_CELLS = 40
-_CELL = 8e-3  # s
+_CELL = 1e-2  # s
 _FEWEST, _MOST = 80, 240  # cells
 _CELLS_PER_PIECE = 5
-_STATICS = 60  # poses that are found one by one
-_REST = 1e-3  # of the first guess's pace: so slow that motion asks for no force
+_STATICS = 40  # poses that are found one by one
+_REST = 1e4  # s: so slow that motion asks for nothing
 # Of one over the duration, with which the shares of some limits grow.
 _POWERS = {"change of rate": 3.0, "tip acceleration": 2.0, "tip jerk": 3.0, "motor rate": 2.0, "tip speed": 1.0}
 _TRIALS = 40
 _ITERATIONS = (40, 12, 6)
 _GAINS = (5e-3, 3e-4)  # of the duration, that are none: roughly, and in the end
-_ALLOWED = 1.0 - 2e-4  # share of the limits that is used, so that they are kept between the points too
-_EXCESS = 5e-4  # over 1, on the fine grid, at which no more points are added
+_ALLOWED = 1.0 - 5e-4  # share of the limits that is used, so that they are kept between the points too
+_EXCESS = 1e-4  # over 1, on the fine grid, at which no more points are added
 _LARGEST_EXCESS = 1e-3
-_ROUNDS = 8
+_ROUNDS = 12
 
 
 def plan_timing(
@@ -62,7 +62,7 @@ def plan_timing(
     tolerance : float
         Greatest distance between the reference's path and the planned one [m].
     cells : int, optional
-        Pieces of the timing. None: of 8 ms each.
+        Pieces of the timing. None: of 10 ms each, at least 80 and at most 240.
     progress : bool
         Show a bar on stderr.
 
@@ -148,11 +148,17 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tupl
     ConvergenceError
         They are not kept to a thousandth.
     """
-    between = points(cells_of(timing.pace), FINE)
+    per_cell = FINE // 3  # which finds most
+    between = points(cells_of(timing.pace), per_cell)
     fine = timing.at(between)
     for _ in range(_ROUNDS):
-        if fine.worst <= 1.0 + _EXCESS:
+        if fine.worst <= 1.0 + _EXCESS and per_cell == FINE:
             return timing, fine
+        if fine.worst <= 1.0 + _EXCESS:
+            per_cell = FINE
+            between = points(cells_of(timing.pace), per_cell)
+            fine = timing.at(between)
+            continue
         x = with_points(timing.x, fine.shares, between, _ALLOWED)
         timing = faster(timing.at(x), most=_ITERATIONS[2], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
         fine = timing.at(between)
@@ -203,7 +209,7 @@ def _started(problem: Problem, path: TipPath) -> Timing:
     acceleration = 5.0 * problem.pose.robot.force_scale / problem.carrier.mass
     # The polynomial of degree 7 has a largest acceleration of 7.5 length / duration^2.
     seconds = math.sqrt(7.5 * path.length / acceleration)
-    still = evaluated(problem, constant_pace(_ROUGH_CELLS, seconds / _REST), x, q)
+    still = evaluated(problem, constant_pace(_ROUGH_CELLS, max(_REST, 1e3 * seconds)), x, q)
     _require_rest(still, path)
     found: Timing | None = None
     resting = still.turned.q.value, still.turned.poses

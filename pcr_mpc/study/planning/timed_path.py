@@ -12,11 +12,11 @@ from scipy.interpolate import BSpline
 from ...frozen import Frozen
 from .course import Course
 from .limits import UNITS, PlanLimits
-from .pace import duration, places
+from .pace import cells_of, duration, places, times
 
 ACTIVE = 0.95  # share of a limit from which on it acts
 _HEADER = "t_s,x_m,y_m,vx_m_s,vy_m_s,ax_m_s2,ay_m_s2"
-_ROW = 1e-3  # s
+_ROW = 5e-4  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,10 @@ class TimedPath(Frozen):
         step : float
             Longest time from row to row [s].
         """
-        t = np.linspace(0.0, self.duration, math.ceil(self.duration / step) + 1)
+        # Rows where pieces of the timing meet: between them the motion is so smooth that their spline is the same.
+        cells = cells_of(self.pace)
+        longest = float(np.diff(times(self.pace, np.linspace(0.0, 1.0, cells + 1))).max())
+        t = times(self.pace, np.linspace(0.0, 1.0, cells * math.ceil(longest / step) + 1))
         rows = np.column_stack([t, self(t).reshape(len(t), 6)])
         return "\n".join([_HEADER, *(",".join(map(repr, row)) for row in rows.tolist())]) + "\n"
 
