@@ -94,7 +94,7 @@ def plot_plan(planned: TimedPath, path: Path) -> None:
     path_axes.set_aspect("equal")
     path_axes.margins(0.1)
     path_axes.locator_params(nbins=6)
-    path_axes.legend(loc="best")
+    path_axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2)
     save_figure(figure, path)
 
 
