@@ -71,6 +71,20 @@ def test_a_start_at_motors_is_where_they_let_the_tip_rest(edited):
     assert (scene.start_tip, scene.start_mode, scene.start_velocity) == (None, None, (0.3, -0.2))
 
 
+def test_a_start_is_searched_for_once(lemniscate):
+    """For scenes that differ in other things too; it is a frozen value, and another start is another."""
+    pose = lemniscate.start()
+    assert replace(lemniscate, duration=2.0, force=(1.0, 0.0)).start() is pose
+    assert not pose.q.flags.writeable
+    elsewhere = replace(lemniscate, start_tip=(0.0, 0.26)).start()
+    assert elsewhere.p.tolist() == [0.0, 0.26]
+    heavier = replace(lemniscate, robot=replace(lemniscate.robot, tip_mass=0.3))
+    assert heavier.start().robot.tip_mass == 0.3
+    resting = replace(lemniscate, trajectory=None, tuning=None, start_tip=None, start_mode=None,
+                      start_motors=tuple(pose.q))  # fmt: skip
+    assert resting.start() is resting.start() is not pose
+
+
 @pytest.mark.parametrize(("period", "fits"), [(0.005, True), (0.0015, False), (4e-4, False), (6.0, True), (6.1, False)])
 def test_a_tuning_with_a_period_that_does_not_fit_is_refused(lemniscate, period, fits):
     """A multiple of the plant's step of 1 ms, at most the duration of 6 s."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -202,7 +203,7 @@ class Scene:
     def _start(self) -> Equilibrium:
         if self.start_motors is not None:
             _require_within_stops(self)
-            eq = forward_statics(self.robot, self.start_motors)
+            eq = _resting(self.robot, self.start_motors)
             if self.trajectory is not None:
                 begin = self.trajectory(np.zeros(1))[0, 0]
                 if np.hypot(*(begin - eq.p)) > _START_TOLERANCE * self.robot.lengths.mean():
@@ -212,11 +213,23 @@ class Scene:
                         key="start.motors",
                     )
             return eq
-        return inverse_statics(self.robot, self.start_tip, mode=self.start_mode)
+        assert self.start_tip is not None
+        return _held(self.robot, self.start_tip, self.start_mode)
 
     def make_plant(self) -> Plant:
         """Build the plant of this scene."""
         return self.plant.make(self.robot)
+
+
+# A search takes up to a second, and checks, studies and every run of a scene ask for the same.
+@lru_cache(maxsize=32)
+def _held(robot: Robot, tip: tuple[float, float], mode: str | None) -> Equilibrium:
+    return inverse_statics(robot, tip, mode=mode)
+
+
+@lru_cache(maxsize=32)
+def _resting(robot: Robot, motors: tuple[float, ...]) -> Equilibrium:
+    return forward_statics(robot, motors)
 
 
 def load_scene(path: str | Path) -> Scene:
