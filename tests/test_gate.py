@@ -7,7 +7,7 @@ import pytest
 
 from pcr_mpc import PCRError, SimulationError, inverse_statics, load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.loop.controllers import Replay
-from pcr_mpc.loop.gate import PATIENCE
+from pcr_mpc.loop.gate import PATIENCE, _Sensor
 
 from .conftest import CONTROLLERS, MODELS
 
@@ -95,6 +95,15 @@ def test_what_just_passes_does_not_shut_the_gate(lemniscate, tunings):
     runs = [run_spoilt(lemniscate, spoil, tunings["default"]) for spoil in (at(periods), at({}))]
     assert 0.1 < apart_mm(*runs) < 3.0
     assert runs[0].summary()["refused_measurements"] == 0
+
+
+def test_a_surprise_fades_by_half_in_every_period():
+    sensor, seen = _Sensor(), []
+    for surprise in (8.0, 0.0, 0.5, 3.0, 0.0):
+        sensor.believed(surprise)
+        seen.append(sensor.surprise)
+    assert not sensor.refused([0.1], 1e-3)
+    assert [*seen, sensor.surprise] == [8.0, 4.0, 2.0, 3.0, 1.5, 0.75]
 
 
 def test_the_nonlinear_mpc_is_behind_the_gate_too(lemniscate, tunings):

@@ -215,6 +215,24 @@ def test_reset_repeats_bit_for_bit(tuning, target, centre, model, reference, pai
     assert (run() == first).all()
 
 
+@pytest.mark.parametrize("prepared", [False, True])
+def test_a_retuned_one_is_one_that_was_tuned_so(tuning, target, centre, model, pair, wide, prepared):
+    other = replace(tuning, horizon=3, input_weight=0.5, velocity_weight=30.0)
+    mpc, new = (make_nonlinear_mpc(pair, centre, one, wide) for one in (replace(tuning, horizon=2), other))
+    for one in (mpc, new) if prepared else ():
+        one.prepare(model)
+    mpc.retune(other)
+    assert mpc.tuning is other
+    # The terminal weight is that of the model that it was prepared for, not of the first that it meets.
+    met = replace(model, B=1.5 * model.B)
+    reference = Reference(np.tile(target, (3, 1)), np.zeros((3, 2)))
+    plans = [one.solve(far(target), met, reference, np.zeros(2)) for one in (mpc, new)]
+    np.testing.assert_array_equal(plans[0].inputs, plans[1].inputs)
+    if prepared:
+        fresh = make_nonlinear_mpc(pair, centre, other, wide).solve(far(target), met, reference, np.zeros(2))
+        assert np.abs(fresh.inputs - plans[0].inputs).max() > 1e-3
+
+
 @pytest.mark.parametrize("horizon", [1, 2])
 def test_short_horizons(tuning, target, centre, model, pair, wide, horizon):
     reference = Reference(np.tile(target, (horizon, 1)), np.zeros((horizon, 2)))
