@@ -306,7 +306,7 @@ def test_pareto_front():
 
 
 def test_tune_writes_a_tuning_that_beats_its_start(tmp_path, monkeypatch, capsys):
-    """In processes of their own: the start's observer is blind to a heavy load, so every episode of it fails."""
+    """In a process of its own: the start's observer is blind to a heavy load, so every episode of it fails."""
     for folder in (MODELS, CONTROLLERS):
         shutil.copytree(folder, tmp_path / folder.name)
     scene = tmp_path / "models/scenes/pick_and_place.toml"
@@ -316,7 +316,7 @@ def test_tune_writes_a_tuning_that_beats_its_start(tmp_path, monkeypatch, capsys
     poor = tmp_path / "controllers/default.toml"
     poor.write_text(poor.read_text().replace("force_walk = 0.005", "force_walk = 1.0e-6"))
     monkeypatch.chdir(tmp_path)
-    command = ["tune", str(scene), "--trials", "2", "--jobs", "2", "--episodes", "1", "--json"]
+    command = ["tune", str(scene), "--trials", "2", "--jobs", "1", "--episodes", "1", "--json"]
     assert main(command) == 0
     captured = capsys.readouterr()
     assert "2/2" in captured.err
