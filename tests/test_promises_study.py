@@ -56,7 +56,7 @@ def test_tunings_are_compared_on_the_same_episodes(lemniscate, monkeypatch):
     monkeypatch.setattr(tuning_score, "run_episode", noted)
     costs = tuning_score.measure(lemniscate, start, replace(start, name="other", input_weight=1.0), [4, 5], Spread())
     assert seen == [(start.name, 0, EXACT), ("other", 0, EXACT), ("other", 4, Spread()), ("other", 5, Spread())]
-    assert (costs.nominal_mm, costs.failure_rate) == (1.0, 0.0)
+    assert (costs.nominal_mm, costs.failure_rate, costs.late) == (1.0, 0.0, 0.0)
     assert 5.0 <= costs.tracking_mm <= 6.0
 
 
