@@ -116,16 +116,18 @@ def still(scene, **other):
 
 
 def test_a_plant_step_beyond_the_integrators_limit_is_an_error(scene, found):
-    """RK4 is stable up to 2.785 / omega: of a step of 0.2 s that is too little, of 0.1 s only near."""
+    """RK4 is stable up to 2.785 / omega."""
     figures = {**found.figures, "reference": None}
-    stiffest = found.pose.stiffness_eigenvalues[1]
-    for dt, level in ((0.2, "error"), (0.1, "warning"), (0.05, None)):
-        other = replace(scene, plant=replace(scene.plant, dt=dt), period=0.2)
+    # The plant without the rods' inertia moves the tip's mass alone.
+    longest = float(2.785 / np.sqrt(found.pose.stiffness_eigenvalues[1] / scene.robot.tip_mass))
+    for share, level in ((1.2, "error"), (0.8, "warning"), (0.3, None)):
+        dt = share * longest
+        other = replace(scene, plant=replace(scene.plant, dt=dt), period=dt, duration=20 * dt)
         steps, remarks = about_steps(other, np.eye(2), figures)
-        # The plant without the rods' inertia moves the tip's mass alone.
-        assert steps["longest_stable_step_s"] == pytest.approx(2.785 / np.sqrt(stiffest / scene.robot.tip_mass))
+        assert steps["longest_stable_step_s"] == pytest.approx(longest)
         assert [one.level for one in remarks if one.about == "plant step"] == ([level] if level else [])
-        assert [one.level for one in remarks if one.about == "control period"] == ["warning"]  # of a swing of 0.3 s
+        # A swing takes 2 pi / 2.785 = 2.3 of the longest steps.
+        assert [one.level for one in remarks if one.about == "control period"] == ["warning"]
     assert about_steps(scene, np.eye(2), figures)[1] == []
 
 
@@ -147,11 +149,13 @@ def test_a_wire_beyond_its_strain_is_an_error(scene):
     assert found.figures["start"]["strain"] == pytest.approx([0.0114, 0.0114], rel=0.02)
 
 
-def test_a_start_that_no_motor_holds_is_an_error(scene):
-    weak = replace(scene.robot, torque_limit=0.2)
-    found = examine(still(scene, robot=weak, pose_limits=replace(scene.pose_limits, torque=None)))
-    assert [one.level for one in found.errors] == ["error"]
-    assert re.search(r"takes -?0\.7\d+ N m of motor \d, which has 0\.2 N m", found.errors[0].text)
+def test_a_start_that_no_motor_holds_is_an_error(scene, found):
+    torque = max(found.figures["start"]["torque_Nm"])
+    weak = replace(scene.robot, torque_limit=torque / 2)
+    without = examine(still(scene, robot=weak, pose_limits=replace(scene.pose_limits, torque=None)))
+    assert [one.level for one in without.errors] == ["error"]
+    said = re.search(r"takes -?(\S+) N m of motor \d, which has (\S+) N m", without.errors[0].text)
+    assert [float(number) for number in said.groups()] == pytest.approx([torque, torque / 2], rel=1e-3)
 
 
 def test_a_robot_is_checked_in_a_pose_of_its_own(tmp_path, capsys):
@@ -201,6 +205,6 @@ def test_three_rods_have_a_motor_more_than_the_tip_needs(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["heavy_rods", "vertical", "curved_rods", "near_straight", "payload", "release"])
+@pytest.mark.parametrize("name", ["heavy_rods", "vertical", "payload", "release"])
 def test_shipped_scenes_of_all_kinds_can_run(name):
     assert examine(load_scene(shipped(name))).errors == []
