@@ -28,6 +28,7 @@ examples:
   pcr-mpc copy lemniscate mine                          a copy of that scene to change
   pcr-mpc new mine --diameter 1e-3 --length 0.5         a robot of your own to start from, in mine/
   pcr-mpc check mine/scene.toml                         what can be said of it without running it
+
 Where a file is wanted, a name is one of pcr-mpc models; a path, such as ./mine/scene.toml, is that file.
 """
 
