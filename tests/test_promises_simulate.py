@@ -159,6 +159,14 @@ def test_times_of_a_plan_and_what_it_met_are_kept(scene):
     assert run.summary()["qp_iterations"] == {"p50": 0, "max": 7}
 
 
+def test_progress_is_shown_where_it_is_asked_for(scene, capsys):
+    for wanted in (False, True):
+        simulate(scene, scene.make_plant(), HoldMotors(2), progress=wanted)
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert (f"{scene.name}: 100%" in err and f"{PERIODS}/{PERIODS}" in err) if wanted else err == ""
+
+
 # --- what is measured -------------------------------------------------------------------------------------------------
 
 
