@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import ModelError, load_path, load_run, load_scene, make_controller, simulate
+from pcr_mpc import Blended, ModelError, check_scene, load_path, load_run, load_scene, make_controller, simulate
 from pcr_mpc.loop.references.tabulated import Tabulated
 
 from .conftest import MODELS
@@ -90,6 +90,60 @@ def test_what_is_wrong_is_said_with_its_place(tmp_path, content, message):
         load_path(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert caught.value.file == str(path)
+
+
+def circle(tmp_path, rate, decimals):
+    """A circle of 60 mm in 3 s, and the same as a file."""
+    t = np.arange(3 * rate + 1) / rate
+    phi = 2 * np.pi * t / 3
+    points = np.stack([0.03 * np.cos(phi), 0.25 + 0.03 * np.sin(phi)], axis=1)
+    lines = [f"{a:.4f},{x:.{decimals}f},{y:.{decimals}f}\n" for a, (x, y) in zip(t, points, strict=True)]
+    return written(tmp_path, "t_s,x_m,y_m\n" + "".join(lines)), t, points
+
+
+@pytest.mark.parametrize(("rate", "decimals"), [(1000, 6), (100, 4), (500, 3), (30, 5)])
+def test_the_rounding_of_a_dense_file_does_not_shake_the_tip(tmp_path, rate, decimals):
+    file, _, _ = circle(tmp_path, rate, decimals)
+    path = load_path(file)
+    unit = 10.0**-decimals
+    assert path.smoothing == pytest.approx(unit / np.sqrt(12))
+    fine = np.linspace(0.1, 2.9, 2000)
+    phi = 2 * np.pi * fine / 3
+    truth = np.stack([0.03 * np.cos(phi), 0.25 + 0.03 * np.sin(phi)], axis=1)
+    assert np.linalg.norm(path(fine)[:, 0] - truth, axis=1).max() < unit
+    assert path.residuals.max() < 2 * unit
+    exact = 0.03 * (2 * np.pi / 3) ** 2
+    assert np.linalg.norm(path(fine)[:, 2], axis=1).max() < 1.3 * exact
+    through = load_path(file, smoothing=0.0)
+    assert through.residuals.max() < 1e-12
+    if rate > 30:
+        assert np.linalg.norm(through(fine)[:, 2], axis=1).max() > 5 * exact  # else the test says nothing
+
+
+def test_rows_that_mean_what_they_say_are_met(tmp_path):
+    """Few rows, rows with all their digits, and corners."""
+    assert load_path(written(tmp_path, GOOD)).smoothing == 0.0
+    file, _, points = circle(tmp_path, 100, 15)
+    assert load_path(file).residuals.max() < 1e-12
+    t = np.linspace(0.0, 4.0, 121)
+    corners = np.array([[-0.03, 0.22], [0.03, 0.22], [0.03, 0.28], [-0.03, 0.28], [-0.03, 0.22]])
+    square = np.stack([np.interp(t, np.arange(5), column) for column in corners.T], axis=1)
+    path = Tabulated(t, square)
+    assert path.scatter == 0.0
+    assert Tabulated(np.arange(121) / 30, points[::2][:121]).scatter == 0.0
+
+
+def test_noise_is_seen_and_its_size(tmp_path):
+    t, points = rows()
+    assert Tabulated(t, points).scatter == pytest.approx(5e-4, rel=0.25)
+    assert Tabulated(t, points, smoothing=5e-4).scatter == 0.0
+    assert load_path(SCENES / "hand_drawn.csv").smoothing == 0.0  # not explained by its digits
+    scene = load_scene(SCENES / "hand_drawn.toml")
+    rough = Blended(Tabulated(t, points))
+    begin = tuple(rough(np.zeros(1))[0, 0].tolist())
+    (line,) = [line for line in check_scene(replace(scene, trajectory=rough, start_tip=begin)) if "scatter" in line]
+    assert f"smoothing = {Tabulated(t, points).scatter:.2g}" in line
+    assert check_scene(scene) == []
 
 
 def test_files_that_are_not_text_or_not_there(tmp_path):

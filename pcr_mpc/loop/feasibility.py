@@ -9,6 +9,8 @@ import numpy as np
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from .feed_forward import InverseDynamics, feed_forward
+from .references.blended import Blended
+from .references.tabulated import Tabulated
 from .scene import Scene
 from .slowing import Slowed, advice
 from .smoothness import contradictions, jumps
@@ -164,6 +166,12 @@ def _roughness(scene: Scene, reference: InverseDynamics) -> list[str]:
                 f"the reference's velocity jumps by {jump.size:.3g} m/s at t = {jump.t:.3f} s{times}, which nothing "
                 "can follow; blend it (start, end), round or smooth it"
             )
+    rows = scene.trajectory.path if isinstance(scene.trajectory, Blended) else scene.trajectory
+    if isinstance(rows, Tabulated) and rows.scatter:
+        lines.append(
+            f"the rows of the reference scatter by about {1e3 * rows.scatter:.2g} mm, which becomes acceleration; if "
+            f"that is noise, say so: smoothing = {rows.scatter:.2g}"
+        )
     return lines + contradictions(scene.trajectory, t)
 
 

@@ -298,7 +298,8 @@ def load_scene(path: str | Path) -> Scene:
         begin = trajectory(np.zeros(1))[0, 0]
         if np.hypot(*(begin - tip)) > _START_ROUNDING * robot.lengths.mean():
             raise ModelError(
-                f"{path}: start.tip {tip} is not where the reference begins, {tuple(begin.tolist())}",
+                f"{path}: start.tip {tip} is not where the reference begins, {tuple(begin.tolist())}; without "
+                "start.tip it starts there",
                 file=str(path),
                 key="start.tip",
             )

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import ModelError, described
+from .rows import rounding
 from .tabulated import Tabulated
 
 _REQUIRED = ("t_s", "x_m", "y_m")
@@ -20,7 +21,7 @@ _NEAR = 0.6  # likeness of a column's name to a known one
 _FAR, _STEP, _LONG = 20.0, 5.0, 600.0
 
 
-def load_path(file: str | Path, *, smoothing: float = 0.0, closed: bool = False) -> Tabulated:
+def load_path(file: str | Path, *, smoothing: float | None = None, closed: bool = False) -> Tabulated:
     """Read a path from a CSV file: columns t_s, x_m, y_m, and if they are known vx_m_s, vy_m_s, ax_m_s2, ay_m_s2.
 
     Rows may be at any times, in order; they count from the first one. Columns may be in any order. Empty lines, and
@@ -30,7 +31,8 @@ def load_path(file: str | Path, *, smoothing: float = 0.0, closed: bool = False)
     ----------
     file : str or Path
     smoothing, closed
-        See `Tabulated`.
+        See `Tabulated`. None: that of rounding to the digits in the file, where there are so many rows that it would
+        shake the tip, else zero.
 
     Raises
     ------
@@ -51,6 +53,8 @@ def load_path(file: str | Path, *, smoothing: float = 0.0, closed: bool = False)
         np.stack([table[x], table[y]], axis=1).tolist() if x in table else None for x, y in _PAIRS
     )
     points = np.stack([table["x_m"], table["y_m"]], axis=1).tolist()
+    if smoothing is None:
+        smoothing = 0.0 if velocities else rounding(table["t_s"], np.array(points), _resolution(names, lines[1:]))
     try:
         return Tabulated(
             tuple(table["t_s"].tolist()), points, velocities, accelerations, smoothing=smoothing, closed=closed
@@ -115,6 +119,13 @@ def _row(path: Path, line: int, names: list[str], cells: list[str]) -> list[floa
             raise _wrong(path, f"line {line}: {name} is {cell!r}, expected a finite number")
         values.append(value)
     return values
+
+
+def _resolution(names: list[str], lines: list[tuple[int, list[str]]]) -> float:
+    """Of the last digit in which a position is given [m]."""
+    cells = (cells[names.index(name)].lower() for name in ("x_m", "y_m") for _, cells in lines)
+    split = (cell.partition("e") for cell in cells)
+    return 10.0 ** -max((len(digits.partition(".")[2]) - int(power or 0) for digits, _, power in split), default=0)
 
 
 def _require_order(path: Path, t: np.ndarray, lines: list[int]) -> None:

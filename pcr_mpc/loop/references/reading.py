@@ -129,7 +129,7 @@ def _through(table: Table) -> dict[str, Any]:
 
 def _file(table: Table) -> Tabulated:
     file = table.text("file")
-    smoothing = table.number("smoothing", 0.0, minimum=0.0)
+    smoothing = table.number("smoothing", minimum=0.0) if table.has("smoothing") else None
     return load_path(table.path.parent / file, smoothing=smoothing, closed=_closed(table))
 
 

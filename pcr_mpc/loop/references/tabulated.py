@@ -11,6 +11,7 @@ from scipy.interpolate import BPoly, BSpline, CubicSpline, splprep
 
 from ...errors import ModelError, check_numbers, checked_array
 from .curves import Points
+from .rows import scatter
 
 _DEGREE = 5  # of the spline that smooths: acceleration is a smooth cubic
 _LEAST = {"rows": 4, "smoothed": 8, "hermite": 2}
@@ -90,6 +91,13 @@ class Tabulated:
     def residuals(self) -> np.ndarray:
         """Distances of the path from its rows, shape (K,) [m]."""
         return np.asarray(np.linalg.norm(self(np.array(self.times))[:, 0] - np.array(self.points), axis=1))
+
+    @cached_property
+    def scatter(self) -> float:
+        """Standard deviation of each coordinate's noise, if the rows look noisy and are not smoothed, else zero [m]."""
+        if self.smoothing or self.velocities is not None:
+            return 0.0
+        return scatter(np.array(self.times), np.array(self.points))
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """See `Trajectory`."""
