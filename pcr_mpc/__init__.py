@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .control.qp import QuadraticProgram, Reference, build_qp
     from .control.tuning import Limits, Tuning, load_tuning
     from .errors import (
+        AmbiguousPoseError,
         CompilerError,
         ConvergenceError,
         InfeasibleError,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from .loop.references.tabulated import Tabulated
     from .loop.run import Run, load_run
     from .loop.scene import Scene, load_scene
+    from .loop.sensors import Sensors
     from .loop.simulate import simulate
     from .loop.tracking import TrackingController, make_controller
     from .loop.trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MATERIALS",
+    "AmbiguousPoseError",
     "Blended",
     "Circle",
     "CompilerError",
@@ -92,6 +95,7 @@ __all__ = [
     "Scene",
     "Section",
     "Sensitivities",
+    "Sensors",
     "SimulationError",
     "Spline",
     "Spread",
@@ -143,6 +147,7 @@ _WHERE = {
     "control.qp": ("QuadraticProgram", "Reference", "build_qp"),
     "control.tuning": ("Limits", "Tuning", "load_tuning"),
     "errors": (
+        "AmbiguousPoseError",
         "CompilerError",
         "ConvergenceError",
         "InfeasibleError",
@@ -163,6 +168,7 @@ _WHERE = {
     "loop.references.tabulated": ("Tabulated",),
     "loop.run": ("Run", "load_run"),
     "loop.scene": ("Scene", "load_scene"),
+    "loop.sensors": ("Sensors",),
     "loop.simulate": ("simulate",),
     "loop.tracking": ("TrackingController", "make_controller"),
     "loop.trajectory": ("Hold", "Lemniscate", "PickAndPlace", "Trajectory"),

@@ -72,7 +72,11 @@ class ReadOnlyError(PCRError, AttributeError):
 
 
 class MeasurementError(PCRError, ValueError):
-    """A controller's first measurement contradicts the pose in which it was started, as other units do."""
+    """A controller's first measurement contradicts the pose in which it was started, or fits no pose of the robot."""
+
+
+class AmbiguousPoseError(PCRError, ValueError):
+    """Several poses fit what was measured at a start: ``candidates``, pairs of working mode and load [N]."""
 
 
 class CompilerError(PCRError):

@@ -167,6 +167,17 @@ class Foresight:
         self._plant.recall(self._records[0])
         return self._plant.equilibrium(x)
 
+    def plant_at(self, x: np.ndarray, period: float) -> Plant:
+        """Make a plant that moves as the model does, by steps of a period, from the state x where the next begins."""
+        model = self._plant
+        shooting = model.shooting
+        plant = Plant(
+            model.robot, method=model.method, segments=shooting.segments, steps=shooting.steps, scheme=shooting.scheme,
+            inertia=model.inertia, integrator="rk4", dt=period,
+        )  # fmt: skip
+        plant.reset(x, self.pose(x))
+        return plant
+
     def target_from(self, other: Foresight) -> None:
         """Go on with the motor target, and the sum of the commands, of another one of the same robot."""
         for name in ("target", "shift", "reckoned"):

@@ -84,11 +84,17 @@ class Gate:
         self._dt, self._wrapped = dt, wrapped
         self.start(np.zeros(robot.n_rods))
 
-    def start(self, q: np.ndarray) -> None:
-        """Begin with motors that are at the angles q [rad]."""
+    def start(self, q: np.ndarray, *, first: bool = True) -> None:
+        """Begin with motors that are at the angles q [rad]; ``first``: what is measured next is looked at for units."""
         self._tip, self._encoders = _Sensor(), _Sensor()
         self._before = q.tolist()
-        self._first = True
+        self._first = first
+
+    def pass_by(self, count: int, q: np.ndarray) -> None:
+        """Nothing was measured for so many periods, after which the motors are expected at q [rad]."""
+        self._tip.surprise = max(self._tip.surprise, self._near * count / _TIP_ECHO)
+        self._encoders.surprise = max(self._encoders.surprise, self._turn * count / _ANGLE_ECHO)
+        self._before = q.tolist()
 
     def sift(self, k: int, x: np.ndarray, expected: np.ndarray, with_velocity: bool) -> Sifted:
         """What of a measurement is to be believed.

@@ -373,13 +373,13 @@ def _pose_limits(table: Table, robot: Robot) -> PoseLimits:
         raise table.fail("tip_lower", "give both tip_lower and tip_upper, or neither")
     if corners[0] is not None and not all(low < high for low, high in zip(*corners, strict=True)):
         raise table.fail("tip_lower", f"{corners[0]} is not below tip_upper {corners[1]}")
-    softness = _LEAST_STIFFNESS * float((robot.stiffnesses / robot.lengths**3).sum())
+    usual = default_margins(robot)
     return PoseLimits(
         robot.torque_limit,
         corners[0],
         corners[1],
-        table.number("rod_margin", _LEAST_ROD_MARGIN, minimum=0.0, maximum=0.9) or None,
-        table.number("stiffness", softness, minimum=0.0) or None,
+        table.number("rod_margin", usual.rod_margin or 0.0, minimum=0.0, maximum=0.9) or None,
+        table.number("stiffness", usual.stiffness or 0.0, minimum=0.0) or None,
         _strain_limit(table, robot),
     )
 
@@ -392,5 +392,12 @@ def _strain_limit(table: Table, robot: Robot) -> float | tuple[float, ...] | Non
         if own and all(rod.half_thickness is None for rod in robot.rods):
             raise table.fail("strain", f"no rod of {robot.name} has a section, and so no strain is known; state it")
         return own or None
+    return default_margins(robot).strain
+
+
+def default_margins(robot: Robot) -> PoseLimits:
+    """Limits of poses that are kept if nobody says otherwise: torque, margins to the folds, strain of the materials."""
+    softness = _LEAST_STIFFNESS * float((robot.stiffnesses / robot.lengths**3).sum())
     limits = robot.strain_limits
-    return tuple(limits.tolist()) if np.isfinite(limits).any() else None
+    strain = tuple(limits.tolist()) if np.isfinite(limits).any() else None
+    return PoseLimits(robot.torque_limit, None, None, _LEAST_ROD_MARGIN, softness, strain)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..control.laws import Law
 from ..control.mpc import LinearMPC
-from ..control.observer import DisturbanceObserver
+from ..control.observer import DisturbanceObserver, ObserverTuning
 from ..control.plan import Plan
 from ..control.qp import Reference
 from ..control.tuning import SAME_ANGLE, Tuning
@@ -27,6 +29,11 @@ from .controllers import Decision, HoldMotors
 from .feed_forward import InverseDynamics, feed_forward, held
 from .foresight import Foresight, Outlook
 from .gate import Event
+from .live.loop import LiveLoop
+from .live.motions import as_trajectory
+from .live.on_the_fly import OnTheFly
+from .live.reference import Asked, LiveReference
+from .live.scene import live_scene
 from .parts import (
     graph_of,
     make_foresight,
@@ -38,14 +45,18 @@ from .parts import (
     write_constants,
 )
 from .scene import Scene
+from .sensors import EXACT_SENSORS, Sensors, sensors_of
+from .start_pose import StartPose, find_start
 from .target import MotorTarget
 from .track import Track
+
+_SETTLING = 8  # looks ahead until the motor target carries a load that is known at the start
 
 __all__ = ["TrackingController", "make_controller", "motor_limits"]
 
 
 @set_once("make a new controller with it", "robot", tuning="call retune, which lets all of it take effect")
-class TrackingController(Remade):
+class TrackingController(OnTheFly, Remade):
     """A control law behind an observer, a prediction of delays and a target that carries the unknown force.
 
     A pickled or copied one is made of the same, and begins with `start`.
@@ -61,17 +72,20 @@ class TrackingController(Remade):
     reference : InverseDynamics, optional
         Inverse dynamics of the scene's reference for that robot, as `feed_forward` finds them, if they are known
         already: most of what a start costs.
+    sensors : Sensors, optional
+        Beside what the scene says of them, for how long they are bridged.
     """
 
     def __init__(
-        self, scene: Scene, tuning: Tuning, robot: Robot | None = None, reference: InverseDynamics | None = None
-    ) -> None:
-        if scene.trajectory is None:
+        self, scene: Scene, tuning: Tuning, robot: Robot | None = None, reference: InverseDynamics | None = None,
+        sensors: Sensors | None = None,
+    ) -> None:  # fmt: skip
+        if scene.trajectory is None and sensors is None:
             raise ValueError(f"scene {scene.name} has no reference to track")
         self.tuning: Tuning
         self.robot = robot or scene.robot
         self.observer: DisturbanceObserver | None = None
-        self._told, self._known = scene, reference
+        self._told, self._known, self._sensors = scene, reference, sensors or sensors_of(scene)
         self._take(tuning)
         needed = scene.n_periods + tuning.horizon + self._delay
         if reference is not None and len(reference.inputs) < needed:
@@ -86,23 +100,74 @@ class TrackingController(Remade):
         self._plan: Plan | None = None
         self._inverse = MotorTarget(self.robot)
         self._law: Law | None = None
+        self._live: LiveLoop | None = None
+        self._track: Track | LiveReference
+        self._k, self._believed, self._turning = -1, (True, True), np.zeros(self.robot.n_rods)
 
     @property
     def reference(self) -> InverseDynamics:
         """Inverse dynamics of the scene's reference, from `start` on."""
         return self._reference
 
-    def start(self, pose: Equilibrium) -> None:
-        """See `Controller`; solves the inverse dynamics of the whole reference, if they are not known."""
-        self._pose = pose
+    def start(
+        self, pose: Equilibrium | ArrayLike, q: ArrayLike | None = None, *, mode: str | None = None,
+        load: float | None = None,
+    ) -> None:  # fmt: skip
+        """Get ready, in a pose or where the robot is measured to stand.
+
+        In a pose the inverse dynamics of the whole reference are solved, if they are not known. From measurements, the
+        reference is solved a little ahead while the robot moves, and joined from where the robot stands: then it may
+        change on the fly.
+
+        Parameters
+        ----------
+        pose : Equilibrium or array_like, shape (2,)
+            In which the robot rests; or the measured position p of its tip [m].
+        q : array_like, shape (n,), optional
+            Measured motor angles [rad], with a measured tip. None: ``pose`` is an equilibrium.
+        mode : str, optional
+            Working mode, where several fit the measurements (see `find_start`).
+        load : float, optional
+            Greatest load that may act on the tip at the start [N] (see `find_start`).
+
+        Raises
+        ------
+        MeasurementError, AmbiguousPoseError
+            No pose, or more than one, fits the measurements.
+        """
+        if q is not None:
+            self._start_live(find_start(self.robot, pose, q, sensors=self._sensors, mode=mode, load=load))
+            return
+        if not isinstance(pose, Equilibrium):
+            raise ValueError(f"start({pose!r}): give an Equilibrium, or the measured tip and motor angles, start(p, q)")
+        self._pose, self._live = pose, None
         self._invert_dynamics(self._known)
+        self._begin(pose)
+
+    def _start_live(self, found: StartPose) -> None:
+        """Get ready for a loop that keeps its own time, in a pose under a load."""
+        if self.tuning.observer is None:
+            self.retune(replace(self.tuning, observer=ObserverTuning()))
+        self._pose, self._u = found.pose, np.zeros(self.robot.n_rods)
+        live = self._live = (
+            self._live if self._live is not None and self._live.fits(self._asked()) else self._make_live()
+        )
+        live.reference.start(found.pose, 0)
+        self._track = live.reference
+        self._begin(found.pose)
+        live.start(found)
+        if self._scene.trajectory is not None:
+            live.follow(self._scene.trajectory, None)
+
+    def _begin(self, pose: Equilibrium) -> None:
+        """Build what is needed, and begin at rest."""
         x = np.concatenate([pose.p, np.zeros(2), pose.q])
         if self._law is None:
             self._law = self._make_law()
         resting = self._rest()
         # One throw-away step pays for building graphs and workspaces before the clock runs.
         self._restart(x, pose, resting)
-        self.step(0, x)
+        self.period_step(0, x)
         self._restart(x, pose, resting)
 
     def _restart(self, x: np.ndarray, pose: Equilibrium, resting: LinearModel) -> None:
@@ -124,8 +189,8 @@ class TrackingController(Remade):
         self._predicts = LinearModels.of([resting])
         self._sent.extend([np.zeros(self.robot.n_rods)] * self._told.delay)
         self._on_the_way = deque([np.zeros(self.robot.n_rods)] * self._delay)
-        self._u = np.zeros(self.robot.n_rods)
-        self._plan = None
+        self._u = self._turning = np.zeros(self.robot.n_rods)
+        self._plan, self._k = None, -1
 
     def retune(self, tuning: Tuning) -> None:
         """Let another tuning take effect, all of it, between two steps.
@@ -171,8 +236,12 @@ class TrackingController(Remade):
         here = last.inputs["estimate"][:-2].copy()
         needed = self._scene.n_periods + tuning.horizon + self._delay
         same_dynamics = (tuning.model.inertia, self._scene) == (old.model.inertia, scene)
-        known = self._reference if same_dynamics and len(self._reference.inputs) >= needed else None
-        self._invert_dynamics(known)
+        if self._live is not None:
+            self._live.ask(self._asked())
+            self._track = self._live.reference
+        else:
+            known = self._reference if same_dynamics and len(self._reference.inputs) >= needed else None
+            self._invert_dynamics(known)
         resting = self._rest() if model_changed else self._resting
         observer = self.observer
         if model_changed or tuning.observer != old.observer:
@@ -198,25 +267,103 @@ class TrackingController(Remade):
                 self._watch.reset(here, pose)
         write_constants(self._foresight, tuning, self._law, self._limits, self.observer)
 
-    def step(self, k: int, x: Any) -> Decision:
-        """See `Controller`; what cannot have been measured is bridged by the prediction, and told in an event.
+    def _on_the_fly(self) -> LiveLoop:
+        """See `OnTheFly`; made when it is first asked for."""
+        if self._law is None or self._foresight is None:
+            raise PCRError(f"controller {self.name} was not started: call start(pose) or start(p, q) first")
+        if self._live is None:
+            if self.tuning.observer is None:
+                self.retune(replace(self.tuning, observer=ObserverTuning()))
+            self._live = self._make_live()
+            self._live.take_over(self._reference, self._k, self._pose, self._scene.trajectory)
+            self._track = self._live.reference
+        return self._live
 
-        Parameters
-        ----------
-        k : int
-            Control period; beyond the end of the scene the last point of the reference is held.
-        x : array_like, shape (4 + n,)
-            Measured state [m, m/s, rad]; what is missing is NaN. With an observer the velocity is not looked at.
+    def _make_live(self) -> LiveLoop:
+        return LiveLoop(self, self._asked(), self._sensors)
 
-        Raises
-        ------
-        PCRError
-            The controller was not started.
-        MeasurementError
-            The first measurement is in other units, or its angles are wrapped.
-        ValueError
-            Names the argument: x has another shape, or k is no period.
-        """
+    def _asked(self) -> Asked:
+        scene, tuning = self._scene, self.tuning
+        return Asked(self.robot, scene.period, self._delay, tuning.horizon, tuning.model.inertia, scene.payload,
+                     tuning.model.compiled)  # fmt: skip
+
+    @property
+    def expected(self) -> np.ndarray:
+        """State that is expected at the next step, shape (4 + n,)."""
+        assert self._foresight is not None
+        return np.asarray(self._foresight.inputs["estimate"][:-2])
+
+    @property
+    def turning(self) -> np.ndarray:
+        """Rates at which the motors turn until the next step [rad/s]."""
+        return self._turning
+
+    @property
+    def believed(self) -> tuple[bool, bool]:
+        """Whether the last measured tip was believed, and the last angles."""
+        return self._believed
+
+    def stand(self, k: int, x: np.ndarray, pose: Equilibrium, force: np.ndarray) -> None:
+        """Begin the estimates anew: state x, rods in ``pose``, a load ``force`` [N]; the last rates are kept."""
+        foresight, period = self._foresight, self._scene.period
+        assert foresight is not None
+        foresight.reset(x, pose)
+        foresight.inputs["estimate"][:] = np.concatenate([x, force])
+        # Where the commands that are on the way will have led; the last one is added in the step.
+        foresight.inputs["reckoned"][:] = x[4:] + period * (sum(self._on_the_way, np.zeros(len(self._u))) - self._u)
+        self._watch.reset(x, pose)
+        self._inverse.start(pose)
+        self._gate.start(x[4:], first=False)
+        self._plan, self._pose = None, pose
+        if not force.any():
+            return
+        # The motors carry the load from the first step on.
+        foresight.inputs["measured"][:] = np.concatenate([x[:2], x[4:]])
+        reckoned = foresight.inputs["reckoned"].copy()
+        self._tell(k, foresight)
+        with suppress(PCRError, ValueError):
+            for _ in range(_SETTLING):
+                foresight()
+        foresight.inputs["reckoned"][:] = reckoned
+
+    def pass_by(self, count: int) -> None:
+        """Reckon ``count`` periods without a step, in which the motors were told nothing new."""
+        foresight, period = self._foresight, self._scene.period
+        assert foresight is not None
+        x, force = self.expected.copy(), foresight.inputs["estimate"][-2:].copy()
+        robot = foresight.plant_at(x, period)
+        for _ in range(count):
+            self._send(self._u)
+            try:
+                x = robot.step(x, self._turning, force)
+            except PCRError:
+                x = self._predicts[0](x, self._turning)
+        foresight.inputs["estimate"][:-2] = x
+        self._gate.pass_by(count, x[4:])
+
+    def coast(self) -> np.ndarray:
+        """Bring the motors to rest, whatever is measured; return the rates of this period [rad/s]."""
+        foresight, period, x = self._foresight, self._scene.period, self.expected
+        assert foresight is not None
+        reckoned = foresight.inputs["reckoned"] + period * self._u
+        u = self._limits.kept(self._limits.slowed(self._u), self._u, x[4:], period, reckoned)
+        self._send(u)
+        x[2:4] = 0.0
+        x[4:] += period * self._turning
+        self._plan = None
+        return u
+
+    def _send(self, u: np.ndarray) -> None:
+        """Note rates that the motors are told without a step."""
+        assert self._foresight is not None
+        self._foresight.inputs["reckoned"][:] += self._scene.period * self._u
+        self._u = u
+        self._sent.append(u)
+        self._on_the_way.append(u)
+        self._turning = self._on_the_way.popleft()
+
+    def period_step(self, k: Any, x: Any) -> Decision:
+        """`step` of period k from the measured state x."""
         if self._law is None or self._foresight is None:
             raise PCRError(f"controller {self.name} was not started: call start(pose) before the first step")
         k, x = checked_period("k", k), measured_vector("x", x, 4 + self.robot.n_rods)
@@ -245,7 +392,7 @@ class TrackingController(Remade):
         self._plan = plan
         self._sent.append(u)
         self._on_the_way.append(u)
-        arriving = self._on_the_way.popleft()
+        arriving = self._turning = self._on_the_way.popleft()
         here = self._look_on(outlook, plan, estimate, arriving, foreseen=plan is decided and not self._delay)
         known = foresight.inputs["estimate"]
         known[:-2], known[-2:] = here, force
@@ -255,6 +402,7 @@ class TrackingController(Remade):
         """Write what is believed of a measurement; what is not is as expected."""
         expected, observer = given["estimate"][:-2], self.observer
         found = self._gate.sift(k, x, expected, observer is None)
+        self._k, self._believed = k, (found.p is not None, found.q is not None)
         if observer is None:
             if found.p is not None:
                 expected[:2], expected[2:4] = found.p, x[2:4] if found.velocity is None else found.velocity
@@ -375,20 +523,58 @@ class TrackingController(Remade):
 
 
 def make_controller(
-    scene: Scene, tuning: Tuning | None = None, robot: Robot | None = None, reference: InverseDynamics | None = None
+    scene: Scene | Robot,
+    tuning: Tuning | Any = None,
+    robot: Robot | Tuning | None = None,
+    reference: InverseDynamics | None = None,
+    *,
+    path: Any = None,
+    period: float | None = None,
+    sensors: Sensors | None = None,
 ) -> TrackingController | HoldMotors:
-    """Build the controller of a scene: that of its tuning, or none where there is nothing to track.
+    """Build the controller of a scene, or of a robot that is to follow a path.
+
+    ``make_controller(scene)`` is that of the scene's tuning, or none where there is nothing to track;
+    ``make_controller(robot, path, tuning, period=0.01)`` needs no scene.
 
     Parameters
     ----------
-    tuning : Tuning, optional
-        Instead of the scene's own.
-    robot : Robot, optional
-        What the controller believes the robot to be.
+    scene : Scene or Robot
+    tuning : Tuning or Trajectory, optional
+        Instead of the scene's own; with a robot, the path (see ``path``), or None for a robot that is to hold.
+    robot : Robot or Tuning, optional
+        What the controller believes the robot of a scene to be; with a robot, the tuning.
     reference : InverseDynamics, optional
-        Inverse dynamics that are known already (see `TrackingController`).
+        Inverse dynamics of a scene that are known already (see `TrackingController`).
+    path : Trajectory or callable, optional
+        Of a robot, by name: a trajectory, or a function of time [s] that returns positions [m].
+    period : float, optional
+        Control period of a robot [s]. None: that of the tuning, or 10 ms.
+    sensors : Sensors, optional
+        Of a robot, or for a scene in the place of its own. None: those of the scene, or exact ones.
+
+    Raises
+    ------
+    ValueError
+        The arguments fit neither a scene nor a robot.
     """
+    if isinstance(scene, Robot):
+        if isinstance(tuning, Tuning) and not isinstance(robot, Tuning):
+            tuning, robot = None, tuning
+        if not isinstance(robot, Tuning):
+            raise ValueError(
+                f"make_controller(robot, path, tuning): tuning is {robot!r}, expected a Tuning; load_tuning reads one"
+            )
+        way = tuning if path is None else path
+        own = robot.period or 0.01 if period is None else period
+        made = live_scene(scene, None if way is None else as_trajectory(way), robot, own, sensors or EXACT_SENSORS)
+        return TrackingController(made, robot, sensors=sensors or EXACT_SENSORS)
+    if isinstance(robot, Tuning) or path is not None or period is not None:
+        raise ValueError("a scene has a path, a period and a robot: make_controller(scene), or give a robot instead")
     tuning = tuning or scene.tuning
     if scene.trajectory is None or tuning is None:
         return HoldMotors(scene.robot.n_rods)
-    return TrackingController(scene, tuning, robot, reference)
+    if sensors is not None:
+        scene = replace(scene, tip_noise=sensors.tip_noise, angle_step=sensors.angle_step, wrapped=sensors.wrapped,
+                        delay=sensors.delay)  # fmt: skip
+    return TrackingController(scene, tuning, robot, reference, sensors)

@@ -205,8 +205,7 @@ def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0
     if p is not None:
         p = checked_vector("p", p, 2)
         robot.require_reachable(p)
-        found = _held(robot, p, q)
-        return sorted(found, key=lambda eq: eq.energy)
+        return held_equilibria(robot, p, q)
     spacing = robot.lengths.min() / 8
     low = (robot.bases - robot.lengths[:, None]).min(axis=0)
     high = (robot.bases + robot.lengths[:, None]).max(axis=0)
@@ -216,7 +215,7 @@ def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0
         at = np.array(start)
         if (np.linalg.norm(at - robot.bases, axis=1) > 0.98 * robot.lengths).any():
             continue
-        for held in _held(robot, at, q):
+        for held in held_equilibria(robot, at, q):
             # Newton's method finds saddles too; the descent finds minima that it runs past.
             for search in (_balance, _descend):
                 balanced = search(solver, held, force)
@@ -225,22 +224,37 @@ def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0
     return sorted(free, key=lambda eq: eq.energy - float(force @ eq.p))
 
 
-def _held(robot: Robot, p: np.ndarray, q: np.ndarray) -> list[Equilibrium]:
-    solver = RodSolver(robot, closed_form_method())
+def held_equilibria(robot: Robot, p: np.ndarray, q: np.ndarray) -> list[Equilibrium]:
+    """Equilibria of the held tip: all combinations of the rods' shapes that are stable in themselves, by energy.
+
+    Complete, to the resolution of the chart, for plain rods; those of others are looked for from the shapes that plain
+    ones would have, and what leads nowhere, or to the same twice, is left out.
+
+    Parameters
+    ----------
+    robot : Robot
+    p : ndarray, shape (2,)
+        Tip, within the rods' reach [m].
+    q : ndarray, shape (n,)
+        Motor angles [rad].
+    """
+    solver = free_solver(robot)
     choices: list[list[HeldShape]] = []
     for rod, angle in zip(robot.rods, q, strict=True):
         dx, dy = (p - rod.base) / rod.length
         cos, sin = np.cos(angle), np.sin(angle)
         choices.append(stable_shapes(cos * dx + sin * dy, cos * dy - sin * dx))
-    found = []
+    found: list[Equilibrium] = []
     for shapes in itertools.product(*choices):
         nodes = np.stack([shape.nodes(8, angle) for shape, angle in zip(shapes, q, strict=True)])
         try:
             solver.start(p, q, nodes)
+            eq = solver.equilibrium(p, q)
         except ConvergenceError:
             continue  # a shape at the very edge of the chart
-        found.append(solver.equilibrium(p, q))
-    return found
+        if robot.needs_shooting is None or not (eq.unstable_rods or any(_same(eq, other) for other in found)):
+            found.append(eq)
+    return sorted(found, key=lambda eq: eq.energy)
 
 
 def _balance(solver: RodSolver, start: Equilibrium, force: np.ndarray) -> Equilibrium | None:
