@@ -59,7 +59,7 @@ def test_whole_turns_do_not_matter_to_encoders_that_wrap(pair, centre):
         (lambda p, q: (p, q[::-1]), "are the motors swapped"),
         (lambda p, q: (p + (0.0, 0.5), q), r"the tip is 0.7566 m from the base of rod 0, whose length is 0.4 m"),
         (lambda p, q: (p, q + (2.5, 0.0)), r"motor 0 is at 5.867 rad, beyond its stops \[1.04, 5.24\] rad"),
-        (lambda p, q: (p, q + (0.0, 0.5)), r"takes a load of \(.*\) N on the tip to stay there, and no more than 2.45 N"),
+        (lambda p, q: (p, q + (0.0, 0.5)), r"takes a load of \(.*\) N on the tip .*, and no more than 2.45 N"),
     ],
 )  # fmt: skip
 def test_what_fits_no_pose_is_said_with_numbers(pair, centre, change, message):
@@ -71,7 +71,7 @@ def test_two_poses_that_fit_are_said_and_a_mode_settles_it():
     """Rods bowed inward that are pulled by 0.8 N, or outward by 1.3 N: at the same angles, and the load is unknown."""
     robot = load_robot(MODELS / "rfrfr.toml")
     eq = inverse_statics(robot, (0.0, 0.25), (0.0, -0.8), guess=inverse_statics(robot, (0.0, 0.25), mode="RL"))
-    with pytest.raises(AmbiguousPoseError, match="may be in any of these poses: .*; give start") as caught:
+    with pytest.raises(AmbiguousPoseError, match=r"may be in any of these poses: .*; give start") as caught:
         find_start(robot, eq.p, eq.q, load=2.0)
     error = pickle.loads(pickle.dumps(caught.value))
     assert dict(error.candidates).keys() == {"LR", "RL"}
@@ -87,7 +87,7 @@ def test_arguments_are_looked_at(pair, centre):
         find_start(pair, centre.p, centre.q, mode="L")
     with pytest.raises(ValueError, match="p is not finite"):
         find_start(pair, (np.nan, 0.2), centre.q)
-    with pytest.raises(MeasurementError, match="is stable|takes a load of"):
+    with pytest.raises(MeasurementError, match=r"is stable|takes a load of"):
         find_start(pair, centre.p, centre.q, mode="RL")
     limited = replace(pair, tip_mass=1e-3)
     with pytest.raises(MeasurementError, match=r"load=\) a greater load"):
