@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...errors import checked_array
+from ..references.blended import Blended, duration_of
 from ..trajectory import Trajectory, sampled, smooth_step
 
 _SUBSTEPS = 4  # of a period in which a target is pursued
@@ -236,6 +237,8 @@ class OfPositions:
 def as_trajectory(path: Any) -> Trajectory:
     """Return a `Trajectory` of one, or of a function of time that tells positions only.
 
+    One that says when it ends, and is not at rest then, is blended to a rest at both ends (see `Blended`).
+
     Raises
     ------
     ValueError
@@ -249,7 +252,7 @@ def as_trajectory(path: Any) -> Trajectory:
     except Exception:  # a function of one time, as math.sin makes it
         shape = ()
     if shape == (2, 3, 2):
-        return path  # type: ignore[no-any-return]
+        return _ending(path)
     # Two times and two axes: a function of one time that NumPy spreads over both returns its transpose.
     if shape == (2, 2) and np.allclose(path(two)[0], np.reshape(path(two[:1]), -1)[:2]):
         return OfPositions(path, many=True)
@@ -260,3 +263,10 @@ def as_trajectory(path: Any) -> Trajectory:
         f"path returned shape {shape or one}, expected (len(t), 3, 2) of positions, velocities and accelerations for "
         "an array of times, or a position of shape (2,) for one"
     )
+
+
+def _ending(path: Trajectory) -> Trajectory:
+    duration = duration_of(path)
+    if duration == math.inf or not sampled(path, np.array([duration]))[0, 1].any():
+        return path
+    return Blended(path)
