@@ -25,7 +25,7 @@ _STEPS = 4  # Runge-Kutta steps from a node to the point of the largest strain
 class StrainWatch:
     """Rows for the largest strain of each rod, by implicit differentiation.
 
-    In closed form the largest moment is at the base, or it is 2 lambda k EI/L^2 L within the rod, and goes from one to
+    In closed form the largest moment is at the base, or it is 2 lambda k EI/L within the rod, and goes from one to
     the other without a kink (see `largest_moment`). Where rods are solved by shooting, the point of the largest strain
     is found, and the rod propagated to it from the node before: to first order the point itself may stay.
 

@@ -55,7 +55,7 @@ class Rod:
         EA [N]; infinite for a rod that does not stretch.
     half_thickness : float or None
         Distance of the outermost fibre from the neutral line [m], the same all along the rod; its strain is
-        |kappa - kappa0| times that. None: not known, and no strain is.
+        ``|kappa - kappa0|`` times that. None: not known, and no strain is.
     strain_limit : float
         Largest strain that the material bears [-]; infinite if it is not known.
     """

@@ -178,7 +178,7 @@ class Equilibrium(Frozen):
     def strain(self, n_points: int = 50) -> np.ndarray:
         """Strain of the outermost fibres from base to tip, shape (n, n_points) [-]; NaN where no thickness is known.
 
-        It is |kappa - kappa0| times half the thickness, and the stretch of a rod that does.
+        It is ``|kappa - kappa0|`` times half the thickness, and the stretch of a rod that does.
         """
         _require_points(n_points)
         rods = zip(self.robot.rods, self.nodes, self.physics, strict=True)
