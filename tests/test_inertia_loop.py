@@ -80,11 +80,11 @@ def test_the_feed_forward_carries_the_inertia_of_the_rods():
 def test_heavy_rods_are_driven_better_by_a_model_that_knows_their_inertia():
     """Both by multiple shooting, for heavy rods sag."""
     scene = replace(load_scene(MODELS / "scenes" / "heavy_rods.toml"), duration=0.3)
-    shooting = replace(scene.plant, method="multiple_shooting", weight="exact", inertia="condensed")
+    shooting = replace(scene.plant, method="multiple_shooting", weight="exact", inertia="condensed", segments=4)
     scene = replace(scene, plant=replace(shooting, integrator="velocity_verlet", dt=2e-3))
     errors = {}
     for inertia in ("none", "condensed"):
-        tuning = replace(scene.tuning, model=replace(scene.tuning.model, inertia=inertia))
+        tuning = replace(scene.tuning, model=replace(scene.tuning.model, inertia=inertia, segments=4))
         run = simulate(scene, scene.make_plant(), make_controller(scene, tuning))
         summary = run.summary()
         errors[inertia] = summary["rms_mm"]
