@@ -12,18 +12,22 @@ from .files import require_folder, require_free, results, saved
 from .loop.scene import load_scene
 from .plant.robot import load_robot
 from .plant.uncertainty import load_uncertainty
+from .report.excitation import excitation_record, excitation_table, plot_excitation
 from .report.identification import (
     identification_comments,
     identification_record,
     identification_table,
     plot_identification,
 )
+from .study.excitation import excite
+from .study.excitation_file import PATH, SCENE, require_readable, write_path, write_scene
 from .study.identification.identify import identify
 from .study.identification.log import Log, read_log
 from .study.identification.robot_file import robot_path, write_robot
 from .study.provenance import commit
 
 _FILES = ("identification.json", "identification.png")
+_EXCITED = (PATH, SCENE, "excitation.json", "excitation.png")
 
 
 def identify_robot(options: argparse.Namespace) -> int:
@@ -75,6 +79,35 @@ def identify_robot(options: argparse.Namespace) -> int:
         print(f"\n{identification_table(found)}\n\nwritten to {', '.join(files.values())}")
     if problem := "; ".join(filter(None, [*problems, problem])):
         raise OutputError(problem, path=str(folder))
+    return 0
+
+
+def excite_robot(options: argparse.Namespace) -> int:
+    """Run `pcr-mpc excite`."""
+    scene, known = load_scene(options.scene), load_uncertainty(robot_path(options.scene))
+    folder = options.out or Path("results") / "excite" / scene.name
+    require_folder(folder, _EXCITED, force=options.overwrite)
+    found = excite(scene, options.duration, trials=options.trials, seed=options.seed, uncertainty=known, progress=True)
+    interrupt.check()
+    files: dict[str, str] = {}
+
+    def write(where: Path) -> None:
+        with results(where) as staged:
+            files.update({name: str(where / name) for name in _EXCITED})
+            write_path(found, staged / PATH)
+            write_scene(found, options.scene, staged / SCENE, where)
+            text = json.dumps(excitation_record(found, files), indent=2)
+            (staged / "excitation.json").write_text(text + "\n", encoding="utf-8")
+            plot_excitation(found, staged / "excitation.png")
+
+    folder, problem = saved(write, folder)
+    if options.json:
+        print(json.dumps(excitation_record(found, files)))
+    else:
+        print(f"\n{excitation_table(found)}\n\nwritten to {folder}; record it with: pcr-mpc track {folder / SCENE}")
+    if problem:
+        raise OutputError(problem, path=str(folder))
+    require_readable(folder / SCENE)
     return 0
 
 

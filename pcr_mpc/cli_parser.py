@@ -23,6 +23,7 @@ examples:
   pcr-mpc plan waypoints --out fast.csv                 that path as fast as the robot can
   pcr-mpc choose vertical                               what physics the scene needs, and why
   pcr-mpc identify lemniscate run.csv --out mine.toml   a robot's numbers from recorded motion
+  pcr-mpc excite lemniscate --duration 6                a motion worth recording
   pcr-mpc timing lemniscate                             step times against the real-time budgets
   pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
   pcr-mpc copy lemniscate mine                          a copy of that scene to change
@@ -177,6 +178,20 @@ def parser() -> argparse.ArgumentParser:
                           "that a later call starts from")  # fmt: skip
     identity.add_argument("--results", type=Path, metavar="FOLDER", help="for table and picture (default "
                           "results/identify/SCENE)")  # fmt: skip
+
+    excitation = command(
+        "excite",
+        "cli_identify",
+        "excite_robot",
+        "Find a motion worth recording: the one from which a robot's numbers would be told best, within its limits. "
+        "Shows how well before anything is recorded; writes the path, and a scene that tracks it.",
+    )
+    excitation.add_argument("scene", help="scene: a file, or a name of pcr-mpc models; robot, start, limits, sensors")
+    excitation.add_argument("--duration", type=float, required=True, metavar="S", help="of the motion [s]")
+    excitation.add_argument("--trials", type=int, default=30, help="motions to try (default 30, some seconds each)")
+    excitation.add_argument("--seed", type=int, default=0, help="of the trials (default 0)")
+    excitation.add_argument("--out", type=Path, metavar="FOLDER", help="for path, scene, table and picture (default "
+                            "results/excite/SCENE)")  # fmt: skip
 
     timing = command(
         "timing",

@@ -184,7 +184,7 @@ def _draw_parameters(axes: Any, estimates: Sequence[Estimate]) -> None:
     axes.plot([], [], "s-", color=ORANGE, label="told by what was believed")
     axes.set_yticks(places, [one.name for one in estimates], fontsize=8)
     axes.set(xlabel="off what was believed [its standard deviations]", title="Numbers with 95 % intervals",
-             ylim=(-0.7, len(estimates) + 1.6))  # fmt: skip
+             ylim=(-0.7, len(estimates) + 2.6))  # fmt: skip
     axes.legend(fontsize=8, loc="upper right")
 
 
