@@ -10,7 +10,6 @@ from . import interrupt
 from .errors import IdentificationError, OutputError
 from .files import require_folder, require_free, results, saved
 from .loop.scene import load_scene
-from .plant.robot import load_robot
 from .plant.uncertainty import load_uncertainty
 from .report.excitation import excitation_record, excitation_table, plot_excitation
 from .report.identification import (
@@ -56,10 +55,9 @@ def identify_robot(options: argparse.Namespace) -> int:
     problems = []
     if options.out:
         comments = identification_comments(found, [Path(log).name for log in options.logs], commit())
-        base = load_robot(robot_file)
 
         def write(where: Path) -> None:
-            write_robot(found, base, where / options.out.name, comments, force=options.overwrite)
+            write_robot(found, robot_file, where / options.out.name, comments, force=options.overwrite)
 
         parent, problem = saved(write, options.out.parent)
         files["robot"], problems = str(parent / options.out.name), [problem]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,14 @@ import numpy as np
 
 from ...errors import ModelError, StudyError
 from ...files import replacing, require_free, stamped
+from ...plant.materials import Section
 from ...plant.robot import Robot, load_robot
 from ...plant.rod import Rod
 from ...plant.uncertainty import Uncertainty
 from ...toml_table import read_toml
 from .result import Identification
+
+_SECTION = ("diameter", "inner_diameter", "width", "thickness")
 
 
 def robot_path(scene_file: Path) -> Path:
@@ -24,14 +28,14 @@ def robot_path(scene_file: Path) -> Path:
 
 
 def write_robot(
-    found: Identification, base: Robot, path: Path, comments: Sequence[str], *, force: bool = False
+    found: Identification, base_file: Path, path: Path, comments: Sequence[str], *, force: bool = False
 ) -> None:
     """Write a robot with the estimates, under some lines of comment.
 
     Parameters
     ----------
-    base : Robot
-        As its file has it, without a scene's own limits and gravity.
+    base_file : Path
+        Of the robot that was believed: what is not a number of `identify`, such as sections, is as it is there.
 
     Raises
     ------
@@ -41,6 +45,8 @@ def write_robot(
         There is a file that was not written here, or was changed since, and ``force`` is not given.
     """
     require_free(path, force=force)
+    base = load_robot(base_file)
+    sections = [{key: rod[key] for key in _SECTION if key in rod} for rod in tomllib.loads(_text(base_file))["rods"]]
     rods = tuple(
         replace(rod, base=new.base, length=new.length, bending_stiffness=new.bending_stiffness,
                 line_density=new.line_density)
@@ -48,7 +54,7 @@ def write_robot(
     )  # fmt: skip
     robot = replace(base, name=path.stem, rods=rods, tip_mass=found.robot.tip_mass, drag=found.robot.drag)
     with replacing(path) as draft:
-        draft.write_text(stamped(_toml(robot, found.uncertainty, comments)), encoding="utf-8")
+        draft.write_text(stamped(_toml(robot, sections, found.uncertainty, comments)), encoding="utf-8")
         try:
             read = load_robot(draft)
         except ModelError as error:
@@ -72,10 +78,16 @@ def _alike(one: Robot, other: Robot) -> bool:
     return len(numbers(one)) == len(numbers(other)) and np.allclose(numbers(one), numbers(other), rtol=1e-9, atol=1e-30)
 
 
-def _toml(robot: Robot, uncertainty: Uncertainty | None, comments: Sequence[str]) -> str:
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8-sig")
+
+
+def _toml(
+    robot: Robot, sections: Sequence[dict[str, float]], uncertainty: Uncertainty | None, comments: Sequence[str]
+) -> str:
     lines = [*(f"# {comment}".rstrip() for comment in comments), f'name = "{robot.name}"']
-    for rod in robot.rods:
-        lines += ["", "[[rods]]", *_rod(rod)]
+    for rod, section in zip(robot.rods, sections, strict=True):
+        lines += ["", "[[rods]]", *_rod(rod, section)]
     lines += [
         "",
         "[tip]",
@@ -104,7 +116,7 @@ def _toml(robot: Robot, uncertainty: Uncertainty | None, comments: Sequence[str]
     return "\n".join(lines) + "\n"
 
 
-def _rod(rod: Rod) -> list[str]:
+def _rod(rod: Rod, sizes: dict[str, float]) -> list[str]:
     lines = [
         _line("base", list(rod.base), "m"),
         _line("length", rod.length, "m"),
@@ -118,17 +130,16 @@ def _rod(rod: Rod) -> list[str]:
         lines.append(_line("stiffness_factors", list(rod.stiffness_factors), "EI(s)/EI"))
     if rod.stretches:
         lines.append(_line("axial_stiffness", rod.axial_stiffness, "N"))
-    if rod.half_thickness is not None:
-        # A round section of the same thickness stands for whatever section it is.
-        diameter = 2.0 * rod.half_thickness
-        area, second_moment = math.pi * diameter**2 / 4.0, math.pi * diameter**4 / 64.0
+    if sizes:
+        # The section is as it was; modulus and density are what these numbers make of them.
+        section = Section.strip(**sizes) if "width" in sizes else Section.round(**sizes)
+        lines += [_line(key, float(value), "m") for key, value in sizes.items()]
         lines += [
-            _line("diameter", diameter, "m; of a round section with this EI and density"),
-            _line("youngs_modulus", rod.bending_stiffness / second_moment, "Pa"),
-            _line("density", rod.line_density / area, "kg/m^3"),
+            _line("youngs_modulus", rod.bending_stiffness / section.second_moment, "Pa"),
+            _line("density", rod.line_density / section.area, "kg/m^3"),
         ]
         if math.isfinite(rod.strain_limit):
-            lines.append(_line("strain_limit", rod.strain_limit, "-"))
+            lines.append(_line("strain_limit", rod.strain_limit, "of the material"))
     return lines
 
 
