@@ -165,6 +165,9 @@ def test_a_robot_is_checked_in_a_pose_of_its_own(tmp_path, capsys):
     record = json.loads(captured.out)
     assert record["of"] == "robot"
     assert record["can_run"]
+    # In front of its motors, in the mode that all shipped scenes of it take, which is the stiffest.
+    assert record["start"]["mode"] == "LR"
+    assert abs(record["start"]["p_m"][0]) < 0.04
     assert max(record["start"]["torque_Nm"]) < load_robot(shipped("planar_pair", "robot")).torque_limit
     assert image.imread(picture).std() > 0.05
     assert f"drawn in {picture}" in captured.err

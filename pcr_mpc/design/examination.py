@@ -23,7 +23,7 @@ from .remarks import Remark, about_rods, about_start, about_steps, unidentifiabl
 
 _CLAMPED_PINNED = 3.9266023  # first root of tan x = tanh x: a rod clamped at its motor, pinned at the tip
 _USUAL_STRETCH = 0.67  # distance of tip and motor over the rod's length, where the shipped robots work
-_TRIES = 24  # of tips at which a robot may be held, before it is given up
+_TRIES = 12  # of tips at which a robot may be held, before it is given up
 _TIPS = 80  # of the lattice from which these are taken
 
 
@@ -76,11 +76,10 @@ def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
     found = Examination(what.name, robot, scene)
     found.figures["rods"] = [_rod_figures(robot, i) for i in range(robot.n_rods)]
     try:
-        found.pose = scene.start() if scene is not None else _usual_pose(robot)
+        found.pose = pose = scene.start() if scene is not None else _usual_pose(robot)
     except PCRError as error:
         found.remarks += [Remark("error", "start", str(error)), *unidentifiable(robot)]
         return found
-    pose = found.pose
     mass, share = _mass(pose)
     found.figures["start"] = _pose_figures(pose, mass, share)
     found.remarks += about_start(pose, robot.torque_limit if scene is None else scene.torque_limit)
@@ -102,35 +101,58 @@ def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
 
 
 def _usual_pose(robot: Robot) -> Equilibrium:
-    """A pose in which a robot is held with rods about as bent as those of the shipped robots, if there is one.
+    """The stiffest pose of a robot where its rods are about as bent as those of the shipped robots, if there is one.
 
     Raises
     ------
     ModelError
         None was found.
     """
-    tips = sorted(
-        tips_within(robot, _TIPS).values(),
-        # Of tips alike the one in front of the motors, y up.
-        key=lambda p: (round(abs(1.0 - min(robot.slacks(p)) - _USUAL_STRETCH), 3), -float(p[1])),
-    )
-    heavy: Equilibrium | None = None
-    for p in tips[:_TRIES]:
+    tips = sorted(tips_within(robot, _TIPS).values(), key=lambda p: _unusual(robot, p))[:_TRIES]
+    beyond: list[Equilibrium] = []
+    for p in tips:
         interrupt.check()
         try:
-            eq = inverse_statics(robot, p)
+            held = [inverse_statics(robot, p)]
         except PCRError:
             continue
-        if float(np.abs(eq.motor_torque).max()) <= robot.torque_limit:
-            return eq
-        heavy = heavy or eq
-    if heavy is not None:
-        return heavy
+        # By multiple shooting a search in every mode takes long.
+        if robot.needs_shooting is None:
+            held = [eq for eq in _in_every_mode(robot, p).values() if eq is not None]
+        good = [eq for eq in held if np.abs(eq.motor_torque).max() <= robot.torque_limit and not eq.overstrained]
+        if good:
+            return max(good, key=_least_stiffness)
+        beyond += held
+    if beyond:
+        return max(beyond, key=_least_stiffness)
     raise ModelError(
-        f"{robot.name}: at none of {min(_TRIES, len(tips))} tips within reach was a stable pose found with the motors "
+        f"{robot.name}: at none of {len(tips)} tips within reach was a stable pose found with the motors "
         "between their stops; look at angle_limits, and at base and length of the rods",
         key="angle_limits",
     )
+
+
+def _unusual(robot: Robot, p: np.ndarray) -> tuple[float, float]:
+    """How far a tip is from where all rods are stretched as usual; of tips alike, y up comes first."""
+    stretches = 1.0 - np.array(robot.slacks(p))
+    return round(float(np.abs(stretches - _USUAL_STRETCH).max()), 3), -float(p[1])
+
+
+def _least_stiffness(eq: Equilibrium) -> float:
+    return float(eq.stiffness_eigenvalues[0])
+
+
+def _in_every_mode(robot: Robot, p: np.ndarray) -> dict[str, Equilibrium | None]:
+    """Pose in each working mode that holds a tip, each by a search of its own; None where there is none."""
+    found: dict[str, Equilibrium | None] = {}
+    for letters in itertools.product("LR", repeat=robot.n_rods):
+        interrupt.check()
+        mode = "".join(letters)
+        try:
+            found[mode] = inverse_statics(robot, p, mode=mode)
+        except PCRError:
+            found[mode] = None
+    return found
 
 
 def _rod_figures(robot: Robot, i: int) -> dict[str, Any]:
@@ -183,14 +205,10 @@ def _pose_figures(eq: Equilibrium, mass: np.ndarray, share: float) -> dict[str, 
 
 
 def _modes(pose: Equilibrium) -> list[dict[str, Any]]:
-    """Which working modes hold the tip of a pose, each by a search of its own."""
+    """Which working modes hold the tip of a pose."""
     rows = []
-    for letters in itertools.product("LR", repeat=pose.robot.n_rods):
-        interrupt.check()
-        mode = "".join(letters)
-        try:
-            eq = pose if mode == pose.mode else inverse_statics(pose.robot, pose.p, mode=mode)
-        except PCRError:
+    for mode, eq in {**_in_every_mode(pose.robot, pose.p), pose.mode: pose}.items():
+        if eq is None:
             rows.append({"mode": mode, "possible": False})
             continue
         strain = float(np.nanmax(eq.max_strain)) if np.isfinite(eq.max_strain).any() else None
@@ -200,7 +218,7 @@ def _modes(pose: Equilibrium) -> list[dict[str, Any]]:
                 "possible": True,
                 "torque_Nm": float(np.abs(eq.motor_torque).max()),
                 "strain": strain,
-                "least_stiffness_N_m": float(eq.stiffness_eigenvalues[0]),
+                "least_stiffness_N_m": _least_stiffness(eq),
                 "energy_J": eq.energy,
             }
         )
