@@ -52,10 +52,15 @@ OWN = {
     "function": turn,
     "blended class": Blended(Turn(np.array([0.0, 0.25])), time_scale=1.0),
 }
-EACH = pytest.mark.parametrize("name", OWN)
 
 
-@EACH
+def each(usual):
+    """One of them in the usual run, the others in the slow one."""
+    names = [name if name == usual else pytest.param(name, marks=pytest.mark.slow) for name in OWN]
+    return pytest.mark.parametrize("name", names)
+
+
+@each("blended class")
 def test_it_runs_as_the_built_in_one_and_comes_back_from_its_record(scene, name, tmp_path):
     mine = replace(scene, trajectory=OWN[name])
     ours = replace(scene, trajectory=TURN)
@@ -91,7 +96,7 @@ def test_it_is_drawn(scene, tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
-@EACH
+@each("class")
 def test_in_episodes_its_dynamics_are_solved_once(scene, name, monkeypatch):
     """Though a worker gets another copy with every task."""
     solved = []

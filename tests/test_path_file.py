@@ -138,7 +138,7 @@ def test_noise_is_seen_and_its_size(tmp_path):
     assert Tabulated(t, points).scatter == pytest.approx(5e-4, rel=0.25)
     assert Tabulated(t, points, smoothing=5e-4).scatter == 0.0
     assert load_path(SCENES / "hand_drawn.csv").smoothing == 0.0  # not explained by its digits
-    scene = load_scene(SCENES / "hand_drawn.toml")
+    scene = replace(load_scene(SCENES / "hand_drawn.toml"), duration=0.6, period=0.02)
     rough = Blended(Tabulated(t, points))
     begin = tuple(rough(np.zeros(1))[0, 0].tolist())
     (line,) = [line for line in check_scene(replace(scene, trajectory=rough, start_tip=begin)) if "scatter" in line]

@@ -51,10 +51,10 @@ FAST = {
 @pytest.mark.parametrize(
     ("path", "limits"),
     [
-        ("circle", {"rate_limit": 3.0}),
+        pytest.param("circle", {"rate_limit": 3.0}, marks=pytest.mark.slow),
         ("circle", {"acceleration_limit": 20.0}),
         ("square", {"rate_limit": 3.0, "acceleration_limit": 1e4}),
-        ("square", {"rate_limit": 100.0, "acceleration_limit": 60.0}),
+        pytest.param("square", {"rate_limit": 100.0, "acceleration_limit": 60.0}, marks=pytest.mark.slow),
         ("square", {"torque_limit": 0.94, "rate_limit": 100.0, "acceleration_limit": 1e4}),
     ],
 )
