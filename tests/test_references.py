@@ -161,6 +161,10 @@ def test_it_is_a_value(name):
     assert (path(t) == again(t)).all()
     with pytest.raises(AttributeError):
         path.start = 1.0
+    if PATHS[name][1]:
+        endless = Blended(PATHS[name][0], repeat=math.inf)
+        assert endless == eval(repr(endless)) == Blended(PATHS[name][0], repeat="for ever")
+        assert endless.duration == math.inf
 
 
 def test_paths_are_equal_in_another_process():
@@ -316,6 +320,9 @@ def test_smoothing_finds_what_is_behind_the_noise():
         (lambda: Tabulated(_T, ROUND, ALONG, smoothing=1e-3), "smoothing", "is for positions"),
         (lambda: Tabulated(_T[:3], ROUND[:3]), "points", "3 rows, expected at least 4"),
         (lambda: Tabulated(_T[:-1], ROUND[:-1], closed=True), "closed", "3.14 mm from its first"),
+        (lambda: Circle((0.0, 0.25), 0.03, 3.0, clockwise="no"), "clockwise", "expected True or False"),
+        (lambda: Spline(SQUARE, 0.1, closed=1), "closed", "expected True or False"),
+        (lambda: Blended(PATHS["circle"][0], repeat="often"), "repeat", "expected a number, found 'often'"),
         (lambda: Blended(3), "path", "expected a trajectory"),
         (lambda: Blended(Hold((0.0, 0.2)), repeat=2), "repeat", "Hold has no duration"),
         (lambda: Blended(PATHS["circle"][0], repeat=1.5), "repeat", "a whole number"),

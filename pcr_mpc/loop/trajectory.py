@@ -177,3 +177,10 @@ def _check_points(instance: Trajectory, *names: str) -> None:
         except ValueError as error:
             raise ModelError(str(error), key=name) from None
         object.__setattr__(instance, name, tuple(point))
+
+
+def check_flag(instance: Trajectory, name: str) -> None:
+    """Raise `ModelError` if an attribute is neither true nor false."""
+    if not isinstance(getattr(instance, name), bool | np.bool_):
+        raise ModelError(f"{name} is {getattr(instance, name)!r}, expected True or False", key=name)
+    object.__setattr__(instance, name, bool(getattr(instance, name)))

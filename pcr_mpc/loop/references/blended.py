@@ -13,6 +13,7 @@ from ..trajectory import Trajectory, risen, sampled
 
 # A blend takes this share of the path's duration, and no longer than that [s], where nothing else is said.
 _SHARE, _LONGEST = 0.25, 1.0
+FOR_EVER = "for ever"
 _SAMPLES = 129
 _AT_REST = 1e-9  # of the largest speed or acceleration
 _SAME = 1e-6  # of the extent, and of the largest speed and acceleration, at both ends of a path that is closed
@@ -35,9 +36,9 @@ class Blended:
     ----------
     path : Trajectory
         One that comes to an end says when by an attribute ``duration`` [s].
-    repeat : float
-        How many times it is gone along, without a stop; infinite: for ever. More than once needs a path that is closed,
-        in position, velocity and acceleration.
+    repeat : float or "for ever"
+        How many times it is gone along, without a stop; infinity is for ever, too. More than once needs a path that is
+        closed, in position, velocity and acceleration.
     start, end : float or None
         Duration of the blends [s], in the path's time. None: a quarter of the path's duration, at most 1 s; or 0 where
         it is at rest there by itself. Zero also leaves a jump of acceleration as it is, but none of velocity.
@@ -47,7 +48,7 @@ class Blended:
 
     path: Trajectory
     _: KW_ONLY
-    repeat: float = 1.0
+    repeat: float | str = 1.0
     start: float | None = None
     end: float | None = None
     time_scale: float = 1.0
@@ -56,14 +57,16 @@ class Blended:
         if not callable(self.path):
             raise ModelError(f"path is {self.path!r}, expected a trajectory", key="path")
         check_numbers(self, {"time_scale": {"above": 0.0}})
-        if self.repeat != math.inf:
+        if self.repeat == math.inf:
+            object.__setattr__(self, "repeat", FOR_EVER)  # which prints as what can be read again
+        if self.repeat != FOR_EVER:
             check_numbers(self, {"repeat": {"minimum": 1.0}})
-            if self.repeat != round(self.repeat):
-                raise ModelError(f"repeat: expected a whole number, or for ever, found {self.repeat:g}", key="repeat")
+            if self._laps != round(self._laps):
+                raise ModelError(f"repeat: expected a whole number, or for ever, found {self._laps:g}", key="repeat")
         for name in ("start", "end"):
             if getattr(self, name) is not None:
                 check_numbers(self, {name: {"minimum": 0.0}})
-        if self.repeat > 1:
+        if self._laps > 1:
             self._require_closed()
         if self.end is not None and math.isinf(self._own):
             raise ModelError("a path that never ends has no end to blend; leave out end, or repeat it less", key="end")
@@ -83,19 +86,23 @@ class Blended:
         return np.stack([place, velocity * rate, acceleration * rate**2 + velocity * change], axis=1)
 
     @property
+    def _laps(self) -> float:
+        return math.inf if isinstance(self.repeat, str) else self.repeat
+
+    @property
     def _lap(self) -> float:
         return duration_of(self.path)
 
     @property
     def _own(self) -> float:
         """The path's own time in which it is all gone along [s]."""
-        return self.repeat * self._lap
+        return self._laps * self._lap
 
     def _within(self, own: np.ndarray) -> np.ndarray:
         """The path's own time within a lap."""
-        if self.repeat == 1 or math.isinf(self._lap):
+        if self._laps == 1 or math.isinf(self._lap):
             return own
-        laps = np.minimum(np.floor(own / self._lap), self.repeat - 1)
+        laps = np.minimum(np.floor(own / self._lap), self._laps - 1)
         return np.asarray(np.clip(own - laps * self._lap, 0.0, self._lap))
 
     def _warped(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -168,7 +175,7 @@ class Blended:
         ):
             if jump > _SAME * scale:
                 raise ModelError(
-                    f"repeat is {self.repeat:g}, but from its end to its beginning the path jumps in "
+                    f"repeat is {self.repeat}, but from its end to its beginning the path jumps in "
                     f"{what.format(f'{jump:.3g}')}; close it, or go along it once",
                     key="repeat",
                 )

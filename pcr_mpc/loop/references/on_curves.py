@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from ...errors import ModelError, check_numbers, checked_array, checked_vector, number_problem
+from ..trajectory import check_flag
 from .curves import Circular, Curve, Points, Rounded, Smooth
 
 _POSITIVE = {"above": 0.0}
@@ -104,6 +105,7 @@ class Circle(_Steady):
             raise ModelError(str(error), key="centre") from None
         object.__setattr__(self, "centre", tuple(centre))
         check_numbers(self, {"radius": _POSITIVE, "period": _POSITIVE, "angle": {}})
+        check_flag(self, "clockwise")
 
     @cached_property
     def curve(self) -> Circular:
@@ -194,11 +196,8 @@ class _ThroughPoints(OnCurve):
     times: tuple[float, ...] | None = None
     closed: bool = False
 
-    _least: ClassVar[int] = 2
-    _stops: ClassVar[bool] = False
-    _marks_of: ClassVar[str] = "legs"
-
     def __post_init__(self) -> None:
+        check_flag(self, "closed")
         _check_points(self, "points", 3 if self.closed else 2, closed=self.closed)
         if (self.speed is None) == (self.times is None):
             raise ModelError("give either speed or times", key="speed")

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.interpolate import BPoly, BSpline, CubicSpline, splprep
 
 from ...errors import ModelError, check_numbers, checked_array
+from ..trajectory import check_flag
 from .curves import Points
 from .rows import scatter
 
@@ -67,6 +68,7 @@ class Tabulated:
                     raise ModelError(f"{name}: {len(rows)} rows for {len(times)} times", key=name)
                 object.__setattr__(self, name, tuple((x, y) for x, y in rows.tolist()))
         check_numbers(self, {"smoothing": {"minimum": 0.0}})
+        check_flag(self, "closed")
         if self.accelerations is not None and self.velocities is None:
             raise ModelError("accelerations without velocities: give both", key="accelerations")
         if self.smoothing and self.velocities is not None:
