@@ -15,7 +15,7 @@ from .linear import Linear
 from .motion import Motion
 
 _MOST_STEPS = 12
-_LARGEST_STEP = 0.3  # rad
+_LARGEST_STEP = 0.15  # rad
 _STEP = 1e-6  # of the motors, in radians, and of the tip, in rod lengths, for differences
 
 

@@ -31,6 +31,7 @@ _REST = 1e4  # s: so slow that motion asks for nothing
 # Of one over the duration, with which the shares of some limits grow.
 _POWERS = {"change of rate": 3.0, "tip acceleration": 2.0, "tip jerk": 3.0, "motor rate": 2.0, "tip speed": 1.0}
 _TRIALS = 40
+_AIM, _NEAR_ENOUGH = 0.8, 0.8  # of the limits; of the duration that is expected to use so much of them
 _ITERATIONS = (40, 12, 6)
 _GAINS = (5e-3, 3e-4)  # of the duration, that are none: roughly, and in the end
 _ALLOWED = 1.0 - 5e-4  # share of the limits that is used, so that they are kept between the points too
@@ -213,17 +214,24 @@ def _started(problem: Problem, path: TipPath) -> Timing:
     _require_rest(still, path)
     found: Timing | None = None
     resting = still.turned.q.value, still.turned.poses
+    kept: Timing | None = None
     for _ in range(_TRIALS):
         try:
             found = evaluated(problem, constant_pace(_ROUGH_CELLS, seconds), x, *resting)
         except PCRError:
+            found = None
+        if kept is not None and (found is None or found.worst > 1.0):
+            return kept
+        if found is None:
             seconds *= 2.0
             continue
-        if found.worst <= 1.0:
-            return found
         shares = dict(zip((use.limit for use in found.uses), found.shares.max(axis=1), strict=True))
-        slower = [1.05 * shares[kind] ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares]
-        seconds *= max(1.1, *slower)
+        ratio = max((shares[kind] / _AIM) ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares)
+        if found.worst <= 1.0:
+            kept = found
+            if ratio > _NEAR_ENOUGH:
+                return kept
+        seconds *= ratio if found.worst <= 1.0 else max(1.1, ratio)
     raise ConvergenceError(
         f"no pace was found at which the robot keeps its limits on this path: in {seconds:.3g} s it would still use "
         f"{found.worst if found else math.inf:.3g} times what is allowed; is a limit almost reached at rest?",
