@@ -139,6 +139,8 @@ def parser() -> argparse.ArgumentParser:
     plan.add_argument("--tip-jerk", type=float, metavar="J", help="largest jerk of the tip [m/s^3] (default: none)")
     plan.add_argument("--tolerance", type=float, default=0.05, metavar="D",
                       help="distance by which the path may be smoothed [mm] (default 0.05)")  # fmt: skip
+    plan.add_argument("--free", action="store_true",
+                      help="let go of the path between the way-points of a spline or of waypoints too")  # fmt: skip
     plan.add_argument("--cells", type=int, help="pieces of the timing (default: of 10 ms each, 80 to 240)")
     plan.add_argument("--no-pictures", action="store_true", help="write the path only")
 

@@ -35,6 +35,7 @@ def plan(options: argparse.Namespace) -> int:
         limits=PlanLimits.of_scene(scene, **more),
         tolerance=1e-3 * options.tolerance,
         cells=options.cells,
+        free=options.free,
         progress=True,
     )
     summary = planned.summary() | {"planning_s": time.perf_counter() - begin}

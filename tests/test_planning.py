@@ -230,6 +230,32 @@ def test_slopes_are_those_of_differences(scene, pair):
 
 
 @pytest.mark.slow
+def test_a_path_between_way_points_may_be_free(points_scene, planned):
+    """It is faster, goes through the points, and keeps its limits, the tip's region among them."""
+    x = planned.motion[:, 0, 0]
+    region = {"tip_lower": (x.min() - 1e-3, 0.15), "tip_upper": (x.max() + 1e-3, 0.3)}
+    limits = replace(PlanLimits.of_scene(points_scene), **region)
+    free = plan_timing(points_scene, limits=limits, cells=80, free=True)
+    assert free.duration < 0.95 * planned.duration
+    assert free.excess <= 1e-3
+    tips = free(np.linspace(0.0, free.duration, 20001))[:, 0]
+    assert tips[:, 0].min() >= region["tip_lower"][0] - 1e-4
+    assert tips[:, 0].max() <= region["tip_upper"][0] + 1e-4
+    order = []
+    for point in points_scene.trajectory.path.points:
+        away = np.linalg.norm(tips - point, axis=1)
+        order.append(int(away.argmin()))
+        assert away.min() < 1.5e-4
+    assert order == sorted(order)
+    robot, t = points_scene.robot, np.linspace(0.0, free.duration, 4001)
+    q = np.stack([eq.q for eq in motors(robot, free, t, points_scene.start())])
+    assert np.abs(np.diff(q, axis=0)).max() / t[1] <= 1.002 * robot.rate_limit
+    assert np.abs(np.diff(q, 2, axis=0)).max() / t[1] ** 2 <= 1.002 * robot.acceleration_limit
+    with pytest.raises(ModelError, match="no way-points"):
+        plan_timing(load_scene(MODELS / "scenes" / "circle_from_file.toml"), free=True)
+
+
+@pytest.mark.slow
 def test_margins_and_torque_limit_too(scene):
     """A margin that the fastest motion does not leave is kept, and takes time."""
     limits = PlanLimits.of_scene(scene)

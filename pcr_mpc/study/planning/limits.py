@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,8 @@ class PlanLimits:
         Least 1 - lambda / lambda_c of a rod; of plain rods only. -infinity is none.
     stiffness : float
         Least eigenvalue of K [N/m]. 0 is none.
+    tip_lower, tip_upper : (float, float) or None
+        Corners of the box in which the tip is to stay [m].
     """
 
     rate: float
@@ -58,6 +61,8 @@ class PlanLimits:
     tip_jerk: float = math.inf
     rod_margin: float = -math.inf
     stiffness: float = 0.0
+    tip_lower: tuple[float, float] | None = None
+    tip_upper: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self)[:6]:
@@ -74,7 +79,7 @@ class PlanLimits:
         return found
 
     @classmethod
-    def of_scene(cls, scene: Scene, **more: float) -> PlanLimits:
+    def of_scene(cls, scene: Scene, **more: Any) -> PlanLimits:
         """Those of a scene and its robot, and more by name."""
         poses: PoseLimits = scene.pose_limits
         return cls(
@@ -83,6 +88,8 @@ class PlanLimits:
             scene.torque_limit,
             rod_margin=-math.inf if poses.rod_margin is None else poses.rod_margin,
             stiffness=poses.stiffness or 0.0,
+            tip_lower=poses.tip_lower,
+            tip_upper=poses.tip_upper,
             **more,
         )
 
@@ -129,6 +136,11 @@ def uses(limits: PlanLimits, moved: Motion, turned: Angles) -> list[Use]:
     ):
         if limit != math.inf:
             found.append(Use(name, (1.0 / limit) * vector.norm(), both=False))
+    if limits.tip_lower is not None and limits.tip_upper is not None:
+        corners = np.array([limits.tip_lower, limits.tip_upper])
+        middle, half = corners.mean(axis=0), np.diff(corners, axis=0)[0] / 2
+        p = moved.path[0]
+        found.append(Use("tip region", Linear((p.value - middle) / half, p.slope / half[:, None]), both=True))
     if limits.stiffness > 0.0:
         found.append(_stiffness(limits.stiffness, turned))
     if limits.rod_margin > -math.inf and turned.poses.method == "closed_form":

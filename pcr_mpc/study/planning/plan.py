@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -15,6 +16,7 @@ from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.free_tip import inverse_statics
 from .course import PacedPath, paced
 from .fastest import Problem, Timing, evaluated, faster
+from .free import freed, way_points
 from .limits import PlanLimits
 from .meshing import FINE, points, repaced, with_points
 from .motion import Carrier
@@ -26,6 +28,7 @@ _ROUGH_CELLS = 40
 _CELL = 1e-2  # s
 _FEWEST, _MOST = 80, 240  # cells
 _CELLS_PER_PIECE = 5
+_FREE_PIECES, _FREE_UNIT = 40, 0.05  # of a free path's spline; of its length, by which it moves in units of trust
 _STATICS = 40  # poses that are found one by one
 _REST = 1e4  # s: so slow that motion asks for nothing
 # Of one over the duration, with which the shares of some limits grow.
@@ -46,6 +49,7 @@ def plan_timing(
     limits: PlanLimits | None = None,
     tolerance: float = 5e-5,
     cells: int | None = None,
+    free: bool = False,
     progress: bool = False,
 ) -> TimedPath:
     """Time-optimal timing of the path of a scene's reference.
@@ -64,6 +68,8 @@ def plan_timing(
         Greatest distance between the reference's path and the planned one [m].
     cells : int, optional
         Pieces of the timing. None: of 10 ms each, at least 80 and at most 240.
+    free : bool
+        Whether the path between the reference's way-points is free too; it is found from the plan of the given one.
     progress : bool
         Show a bar on stderr.
 
@@ -96,6 +102,7 @@ def plan_timing(
         raise ModelError(f"{scene.name}: has no reference, and so no path to plan", key="reference")
     checked_number("tolerance", tolerance, above=0.0)
     limits = PlanLimits.of_scene(scene) if limits is None else limits
+    points_between = way_points(scene.trajectory) if free else np.empty((0, 2))
     own = getattr(scene.trajectory, "duration", math.inf)
     span = own if math.isfinite(own) else scene.duration
     path = path_of(scene.trajectory, span, tolerance)
@@ -108,14 +115,20 @@ def plan_timing(
             bar.set_postfix_str(f"{seconds:.4f} s")
             bar.update()
 
-        _require_region(scene, path)
+        _require_region(scene, limits, path)
         problem = Problem(paced(path), scene.start(), carrier_of(scene, span), limits)
         timing = faster(_started(problem, path), most=_ITERATIONS[0], tolerance=_GAINS[0], told=told)
         wanted = cells or int(np.clip(math.ceil(timing.duration / _CELL), _FEWEST, _MOST))
         timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
         timing = faster(timing, most=_ITERATIONS[1], trust=0.3, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
+        if free:
+            course = freed(timing.problem.course, points_between, _FREE_PIECES, _FREE_UNIT * path.length)
+            problem = replace(timing.problem, course=course)
+            timing = evaluated(problem, timing.pace, timing.x, timing.turned.q.value, timing.turned.poses)
+            timing = faster(timing, most=_ITERATIONS[0], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
         timing, fine = refined(timing, told)
-    return _result(scene.name, timing, fine, path.deviation, iterations)
+    deviation = path.deviation + (_distance(path, fine.moved.path[0].value) if free else 0.0)
+    return _result(scene.name, timing, fine, deviation, iterations)
 
 
 def carrier_of(scene: Scene, span: float) -> Carrier:
@@ -176,12 +189,12 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tupl
     return timing, fine
 
 
-def _require_region(scene: Scene, path: TipPath) -> None:
+def _require_region(scene: Scene, limits: PlanLimits, path: TipPath) -> None:
     """Raise if the path leaves the scene's region, in whatever time."""
     s = np.linspace(0.0, path.length, 10 * _STATICS + 1)
     p = path.derivatives(s)[0]
-    if scene.pose_limits.tip_lower is not None and scene.pose_limits.tip_upper is not None:
-        low, high = np.array(scene.pose_limits.tip_lower), np.array(scene.pose_limits.tip_upper)
+    if limits.tip_lower is not None and limits.tip_upper is not None:
+        low, high = np.array(limits.tip_lower), np.array(limits.tip_upper)
         beyond = np.maximum(low - p, p - high).max(axis=1)
         at = int(beyond.argmax())
         if beyond[at] > 0.0:
@@ -285,6 +298,12 @@ def _require_rest(still: Timing, path: TipPath) -> None:
         share=float(shares[limit, at]),
         s=s,
     )
+
+
+def _distance(path: TipPath, tips: np.ndarray) -> float:
+    """Largest distance of points from a path [m]."""
+    given = path.derivatives(np.linspace(0.0, path.length, 2001))[0]
+    return max(float(np.linalg.norm(given - p, axis=1).min()) for p in tips)
 
 
 def _result(name: str, timing: Timing, fine: Timing, deviation: float, iterations: int) -> TimedPath:
