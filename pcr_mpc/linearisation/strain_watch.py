@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..buffered import graph_cache
+from ..buffered import BufferedFunction, graph_cache
 from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.rods.equations import Layout, RodPhysics, aligned_steps, interpolated, propagation, unpacked
@@ -42,6 +42,7 @@ class StrainWatch:
         self._rods = [(i, float(limits[i])) for i in np.flatnonzero(np.isfinite(limits)).tolist()]
         physics = None if plant.method == "closed_form" else robot_physics(plant.robot)
         self._physics: tuple[RodPhysics, ...] | None = physics
+        self._at_nodes: dict[int, BufferedFunction] = {}
         self._ratios = [(rod.half_thickness or math.nan) / rod.length for rod in plant.robot.rods]
 
     @property
@@ -82,11 +83,17 @@ class StrainWatch:
         physics = self._physics[i]
         nodes = state.unknowns[:, i].reshape((4, -1), order="F")
         count, values = nodes.shape[1], physics.values
-        evaluate = _strain_graph(physics.layout, aligned_steps(physics.layout, count, _STEPS))
         ratio = self._ratios[i]
-        coarse = evaluate(nodes, np.zeros((1, count)), np.arange(count)[None] / count, values, ratio)[0].full()
-        if coarse.max() < _BETWEEN_NODES * _WATCHED * limit:
-            return float(coarse.max()) / limit, np.zeros(3)
+        if i not in self._at_nodes:
+            self._at_nodes[i] = graph = BufferedFunction(_node_graph(physics.layout, count))
+            graph.inputs[1][:], graph.inputs[2][:] = values, ratio
+        graph = self._at_nodes[i]
+        graph.inputs[0][:] = nodes
+        graph()
+        coarse = float(graph.outputs[0][0])
+        if coarse < _BETWEEN_NODES * _WATCHED * limit:
+            return coarse / limit, np.zeros(3)
+        evaluate = _strain_graph(physics.layout, aligned_steps(physics.layout, count, _STEPS))
         s, _ = largest_strain(self._robot.rods[i], nodes, physics)
         j = min(int(s * count), count - 1)
         value, slope = evaluate(nodes[:, j], s - j / count, j / count, values, ratio)
@@ -99,8 +106,22 @@ def _strain_graph(layout: Layout, steps: int) -> Any:
     """Graph (node (4), arc length from it, its s, physics, half thickness over L) -> strain there, its gradient."""
     z, h, s = ca.SX.sym("z", 4), ca.SX.sym("h"), ca.SX.sym("s")
     physics, ratio = ca.SX.sym("physics", layout.size), ca.SX.sym("ratio")
-    theta, n_x, n_y, m = ca.vertsplit(propagation(steps, "rk8", layout)(z, h, s, physics)[2:6])
-    _, compliance, _, factors = unpacked(layout, physics)
-    bend = m if factors is None else m / interpolated(factors, s + h)
-    strain = ca.fabs(compliance * (n_x * ca.cos(theta) + n_y * ca.sin(theta))) + ratio * ca.fabs(bend)
+    there = propagation(steps, "rk8", layout)(z, h, s, physics)[2:6]
+    strain = _strain(layout, physics, there, s + h, ratio)
     return ca.Function("strain", [z, h, s, physics, ratio], [strain, ca.gradient(strain, z)], {"cse": True})
+
+
+@graph_cache(maxsize=16)
+def _node_graph(layout: Layout, count: int) -> Any:
+    """Graph (nodes (4, count), physics, half thickness over L) -> largest strain at a node."""
+    nodes, physics, ratio = ca.SX.sym("nodes", 4, count), ca.SX.sym("physics", layout.size), ca.SX.sym("ratio")
+    found = [_strain(layout, physics, nodes[:, j], j / count, ratio) for j in range(count)]
+    return ca.Function("strains", [nodes, physics, ratio], [ca.norm_inf(ca.vertcat(*found))], {"cse": True})
+
+
+def _strain(layout: Layout, physics: Any, state: Any, s: Any, ratio: Any) -> Any:
+    """Strain of the outer fibre at s, where the rod's state is [theta, n_x, n_y, m]."""
+    theta, n_x, n_y, m = ca.vertsplit(state)
+    _, compliance, _, factors = unpacked(layout, physics)
+    bend = m if factors is None else m / interpolated(factors, s)
+    return ca.fabs(compliance * (n_x * ca.cos(theta) + n_y * ca.sin(theta))) + ratio * ca.fabs(bend)
