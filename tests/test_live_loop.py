@@ -354,6 +354,12 @@ def test_what_is_asked_too_early_is_said(pair, tuning, scene):
         make_controller(scene, path=Hold((0, 0.25)))
 
 
+def test_where_nothing_is_to_be_tracked_the_motors_are_held():
+    held = make_controller(load_scene(MODELS / "scenes" / "release.toml"))
+    held.start((0.0, 0.25), (3.3, -0.2))
+    assert (held.step(tip=(0.0, 0.25), angles=None, time=1.0).u == 0.0).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["three_rods", "heavy_pair", "curved_pair"])
 def test_other_robots(name, tuning):

@@ -121,9 +121,9 @@ class HoldMotors:
     def __init__(self, n_rods: int) -> None:
         self._u = read_only(np.zeros(n_rods))
 
-    def start(self, pose: Equilibrium) -> None:
-        """See `Controller`."""
+    def start(self, pose: Any, q: Any = None) -> None:
+        """See `Controller`; a measured tip and measured angles will do, too."""
 
-    def step(self, k: int, x: np.ndarray) -> Decision:
-        """See `Controller`."""
+    def step(self, k: Any = None, x: Any = None, **measured: Any) -> Decision:
+        """See `Controller`; whatever is measured, and when."""
         return Decision(self._u)

@@ -20,7 +20,8 @@ from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.free_tip import inverse_statics
 
 # Rows in one call of a graph: each size is built once.
-_SIZES = (8, 1)
+BLOCK = 8
+_SIZES = (BLOCK, 1)
 _ITERATIONS = 2  # of the motor angles, each with one of the rods
 _SOLVED = 1e-8  # residuals of the rods, and of the force over sum EI/L^2
 _SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
@@ -77,6 +78,7 @@ class OnlineInverse:
         self._plant = Plant(robot)
         assert self._plant.step_model is not None
         self._model = self._plant.step_model
+        self._memory = sizes(self._model).memory
         self._graphs: dict[int, BufferedFunction] = {}
         self._scale = robot.force_scale
 
@@ -123,7 +125,7 @@ class OnlineInverse:
         """Rows that the graph brings along, up to the first that it does not."""
         graph = self._graph(size)
         start, wanted, numbers = graph.inputs
-        memory, n = sizes(self._model).memory, self._robot.n_rods
+        memory, n = self._memory, self._robot.n_rods
         slopes = last.stiffness.ravel(order="F"), last.coupling.ravel(order="F")
         start[:] = np.concatenate([last.p, last.q, last.force, *slopes, last.record[:memory]])
         wanted = wanted.reshape(4, size, order="F")

@@ -70,8 +70,9 @@ class Following:
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Samples at times t [s] of the loop, shape (len(t), 3, 2)."""
-        found: np.ndarray = _of_path(self.path, t - self.start * self.period) + self._apart(t)
-        return found
+        found = _of_path(self.path, t - self.start * self.period)
+        joined = t.min() >= (self.joins + self.fading) * self.period
+        return found if joined else np.asarray(found + self._apart(t))
 
     def _apart(self, t: np.ndarray) -> np.ndarray:
         span = self.fading * self.period

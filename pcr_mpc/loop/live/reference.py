@@ -15,7 +15,7 @@ from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
 from ..settings import Payload
 from ..trajectory import Trajectory, sampled
-from .inverse import OnlineInverse, Row
+from .inverse import BLOCK, OnlineInverse, Row
 from .motions import Following, Motion, Pursuit
 
 _LOOK_AHEAD = 0.25  # s, beyond the controller's horizon: there is time to brake before what cannot be had
@@ -181,7 +181,9 @@ class LiveReference:
                 each[drop:].copy() for each in (self._samples, self._states, self._forces)
             )
         self.first = k
-        error = self._extend(self._ahead(self._motion) - len(self._rows))
+        missing = self._ahead(self._motion) - len(self._rows)
+        # A block of rows at once costs less than one after the other.
+        error = self._extend(missing + BLOCK - 1) if missing > 0 else None
         if error is None:
             return []
         left = len(self._rows)
