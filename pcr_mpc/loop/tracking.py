@@ -32,7 +32,8 @@ from .gate import Event
 from .live.loop import LiveLoop
 from .live.motions import as_trajectory
 from .live.on_the_fly import OnTheFly
-from .live.reference import Asked, LiveReference
+from .live.reference import LiveReference
+from .live.rows import Asked
 from .live.scene import live_scene
 from .parts import (
     graph_of,

@@ -21,7 +21,8 @@ from ..start_pose import StartPose, find_start
 from ..trajectory import Trajectory
 from .clock import Clock
 from .motions import as_trajectory
-from .reference import Asked, Event, LiveReference
+from .reference import Event, LiveReference
+from .rows import Asked
 
 # Periods without a call that are reckoned; after more, whatever is expected is worth nothing.
 PAUSE = 10
@@ -120,7 +121,7 @@ class LiveLoop:
 
     def fits(self, asked: Asked) -> bool:
         """Whether the reference is for such a controller."""
-        return asked == self._asked
+        return bool(asked == self._asked)
 
     def ask(self, asked: Asked) -> None:
         """Let the reference be for another controller, from the present on."""
