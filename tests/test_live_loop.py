@@ -167,7 +167,7 @@ TIME = st.sampled_from(["on time"] * 8 + ["jitter", "late", "pause", "again", "b
 ACT = st.sampled_from(["nothing"] * 12 + ["follow", "stop", "hold", "jog", "target", "bad target", "bad follow"])
 
 
-@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(READING, TIME, ACT), min_size=15, max_size=40), st.integers(0, 1000))
 def test_whatever_comes_the_motors_keep_their_limits(live, centre, calls, seed):
     """No exception but those of a path that cannot be had, and limits kept, in every call."""
