@@ -227,6 +227,30 @@ def test_a_run_says_what_its_reference_asked(scene, capsys):
     assert reference_demand(short, make_started(short).reference) == asked
 
 
+class Still:
+    """A controller of one's own that knows nothing."""
+
+    def start(self, pose):
+        pass
+
+    def step(self, k, x):
+        return np.zeros(2)
+
+
+def test_with_a_controller_of_ones_own_who_looks_on_is_told_too(scene, capsys):
+    fast = replace(on(scene, FAST["circle"], rate_limit=3.0), duration=0.4, tracking_error=1.0)
+    run = simulate(fast, fast.make_plant(), Still(), progress=True)
+    assert [event["message"] for event in run.events if event["kind"] == "warning"] == check_scene(fast)
+    assert "3 is allowed" in capsys.readouterr().err
+    assert run.asked["rate_rad_s"]["asked"] > 3.0
+    out = on(scene, Line(((0.0, 0.25), (0.0, 0.02)), 0.1))
+    run = simulate(replace(out, tracking_error=1.0), out.make_plant(), Still(), progress=True)
+    assert run.events[0]["message"].startswith("reference at t = 2.0")
+    assert run.asked is None
+    quiet = simulate(replace(fast, duration=0.1), fast.make_plant(), Still())
+    assert quiet.events == []
+
+
 def make_started(scene):
     controller = make_controller(scene)
     controller.start(scene.start())

@@ -14,11 +14,12 @@ from tqdm import tqdm
 
 from .. import interrupt
 from ..control.tuning import Tuning
-from ..errors import SimulationError, checked_array, checked_integer
+from ..errors import PCRError, SimulationError, checked_array, checked_integer
 from ..plant.robot import Robot
+from ..plant.statics.equilibrium import Equilibrium
 from .controllers import Controller, decision_of, name_of
 from .feasibility import demand_line, reference_demand, reference_excess
-from .feed_forward import InverseDynamics
+from .feed_forward import InverseDynamics, feed_forward
 from .foreign_parts import check_parts
 from .record import versions
 from .run import Run
@@ -55,7 +56,8 @@ def simulate(
     Returns
     -------
     Run
-        Its events begin with what the reference asks for in vain, where the controller knows its inverse dynamics.
+        Its events begin with what the reference asks for in vain, where the controller knows its inverse dynamics; with
+        a progress bar in any case.
 
     Raises
     ------
@@ -98,17 +100,12 @@ def simulate(
     events: list[dict[str, Any]] = []
     # What only some controllers know of themselves.
     dynamics, tuning, believed = (getattr(controller, name, None) for name in ("reference", "tuning", "robot"))
-    asked = None
-    if isinstance(dynamics, InverseDynamics) and scene.trajectory is not None:
-        asked = reference_demand(scene, dynamics)
+    known = believed if isinstance(believed, Robot) else scene.robot
+    asked, said = _foreseen(scene, dynamics if isinstance(dynamics, InverseDynamics) else None, known, pose, progress)
+    for line in said:
+        events.append({"t": 0.0, "kind": "warning", "message": line})
         if progress:
-            print(f"{scene.name}: the reference asks for at most {demand_line(asked)}", file=sys.stderr)
-        # For somebody who looks on, how much slower it must be is solved for; else to first order.
-        known = believed if isinstance(believed, Robot) else scene.robot
-        for line in reference_excess(scene, dynamics, pose if progress else None, known):
-            events.append({"t": 0.0, "kind": "warning", "message": line})
-            if progress:
-                print(f"{scene.name}: warning: {line}", file=sys.stderr)
+            print(f"{scene.name}: warning: {line}", file=sys.stderr)
     states[0] = x
     done, decided, snapped = 0, 0, 0
     meanwhile = np.zeros(n)
@@ -235,3 +232,24 @@ def _reference(scene: Scene, t: np.ndarray) -> np.ndarray:
     if scene.trajectory is None:
         return np.full((len(t), 2), np.nan)
     return checked_array("what the scene's trajectory returns", scene.trajectory(t), (len(t), 3, 2))[:, 0]
+
+
+def _foreseen(
+    scene: Scene, dynamics: InverseDynamics | None, robot: Robot, pose: Equilibrium, progress: bool
+) -> tuple[dict[str, Any] | None, list[str]]:
+    """What the reference asks for at most, and in vain; a controller of one's own need not know its dynamics.
+
+    Who looks on is told before the run, and by how much slower it must be is solved for; else it is to first order.
+    """
+    if scene.trajectory is None or (dynamics is None and not progress):
+        return None, []
+    if dynamics is None:
+        robot = scene.robot
+        try:
+            dynamics = feed_forward(scene, robot, pose, 0)
+        except PCRError as error:
+            return None, [str(error)]
+    asked = reference_demand(scene, dynamics)
+    if progress:
+        print(f"{scene.name}: the reference asks for at most {demand_line(asked)}", file=sys.stderr)
+    return asked, reference_excess(scene, dynamics, pose if progress else None, robot)
