@@ -110,6 +110,7 @@ def test_the_scale_that_motion_cannot_tell_is_named(scene, log):
     assert found.fits[0].noise.tip == pytest.approx(5e-5, rel=0.15)
 
 
+@pytest.mark.slow
 def test_outliers_and_gaps(scene, log):
     rng = np.random.default_rng(5)
     p, q, u = noisy(log, 1).p.copy(), noisy(log, 1).q.copy(), log.u.copy()
@@ -310,7 +311,6 @@ def truth_of(name):
     return {key: float(value) for key, value in row.items() if key != "log"}
 
 
-@pytest.mark.slow
 def test_a_recorded_log_with_gaps_and_outliers(scene):
     found = identify(scene, read_log(DATA / "ours_0_gaps.csv", 2))
     assert found.loss == "huber"

@@ -18,6 +18,8 @@ from .problem import Guess, Noise
 
 # Readings about a start by which its position and velocity are guessed.
 _ABOUT = 7
+# Third differences beyond this many times their median are outliers'; those of motion and noise are within ten.
+_JUMP = 50.0
 # Least noise, relative to the mean length of the rods, or in radians: rounding.
 _LEAST = 1e-7
 # Length of a piece of multiple shooting [s], and of a piece of a long run [s].
@@ -37,6 +39,13 @@ def noise_of(log: Log, robot: Robot, known: Noise | None = None) -> Noise:
     least = _LEAST * float(robot.lengths.mean())
     tip, angle = spread(log.p, least), spread(log.q, _LEAST)
     return Noise(max(tip, known.tip), max(angle, known.angle)) if known else Noise(tip, angle)
+
+
+def jumps(log: Log) -> bool:
+    """Whether the tip jumps as no tip does: third differences far beyond what is usual in the log."""
+    change = np.abs(np.diff(log.p, 3, axis=0))
+    usual = np.nanmedian(change, axis=0)
+    return bool((change > _JUMP * np.maximum(usual, 1e-9)).any())
 
 
 def floor_of(robot: Robot) -> Noise:

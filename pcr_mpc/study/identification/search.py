@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...errors import IdentificationError, PCRError
-from .first_guess import LONG, SHORT, first_guess, floor_of, noise_of, pieces_of
+from .first_guess import LONG, SHORT, first_guess, floor_of, jumps, noise_of, pieces_of
 from .parameters import Parameters
 from .prediction import Predictor
 from .problem import Guess, Noise, Problem, Readings
@@ -109,11 +109,14 @@ class _Search:
         place = parameters.index("delay")
         bound = delay if place is None else parameters.free[place].bounds[1]
         self.pieces = pieces_of(predictor.logs, skipped(predictor, bound), length)
-        self.robust = loss == "huber"
+        self.robust = loss == "huber" or (loss == "auto" and any(jumps(log) for log in predictor.logs))
         self.around = first_guess(
             predictor, parameters.robot, self.pieces, predictor.delay(0, {"delay": delay}), len(parameters.free)
         )
         self.noise = [noise_of(log, parameters.robot) for log in predictor.logs]
+        if self.robust:  # what believed numbers leave is no outlier: noise comes down round by round
+            least = Noise(_MISFIT * float(parameters.robot.lengths.mean()), _MISFIT)
+            self.noise = [Noise(max(one.tip, least.tip), max(one.angle, least.angle)) for one in self.noise]
         self.corrections: list[np.ndarray] | None = None
         self.whole = length is None or length == LONG
         self.iterations, self.refused = 0, 0

@@ -93,7 +93,7 @@ def solve(
         gained = loss - new[0]
         loss, residuals, jacobian = new
         tell(loss)
-        little = little + 1 if gained < _LITTLE else 0
+        little = little + 1 if gained < max(_LITTLE, 1e-9 * loss) else 0
     raise _unsolved(f"{_MOST_ITERATIONS} steps were not enough", loss)
 
 
