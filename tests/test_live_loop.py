@@ -300,7 +300,7 @@ def test_a_tuning_without_an_observer_gets_one(pair, tuning, centre):
     controller = make_controller(pair, None, replace(tuning, observer=None))
     loop = Loop(controller, centre).run(5)
     assert controller.tuning.observer is not None
-    assert loop.events == []
+    assert loop.events == ["observer"]
     assert np.allclose(loop.x[:2], centre.p, atol=1e-6)
 
 

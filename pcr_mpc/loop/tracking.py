@@ -147,8 +147,7 @@ class TrackingController(OnTheFly, Remade):
 
     def _start_live(self, found: StartPose) -> None:
         """Get ready for a loop that keeps its own time, in a pose under a load."""
-        if self.tuning.observer is None:
-            self.retune(replace(self.tuning, observer=ObserverTuning()))
+        note = self._require_observer()
         self._pose, self._u = found.pose, np.zeros(self.robot.n_rods)
         live = self._live = (
             self._live if self._live is not None and self._live.fits(self._asked()) else self._make_live()
@@ -159,6 +158,7 @@ class TrackingController(OnTheFly, Remade):
         live.start(found)
         if self._scene.trajectory is not None:
             live.follow(self._scene.trajectory, None)
+        live.notes += note
 
     def _begin(self, pose: Equilibrium) -> None:
         """Build what is needed, and begin at rest."""
@@ -273,12 +273,20 @@ class TrackingController(OnTheFly, Remade):
         if self._law is None or self._foresight is None:
             raise PCRError(f"controller {self.name} was not started: call start(pose) or start(p, q) first")
         if self._live is None:
-            if self.tuning.observer is None:
-                self.retune(replace(self.tuning, observer=ObserverTuning()))
+            note = self._require_observer()
             self._live = self._make_live()
+            self._live.notes += note
             self._live.take_over(self._reference, self._k, self._pose, self._scene.trajectory)
             self._track = self._live.reference
         return self._live
+
+    def _require_observer(self) -> list[tuple[str, str]]:
+        """Put the default observer into a tuning that has none: nobody measures the velocity in a loop of one's own."""
+        if self.tuning.observer is not None:
+            return []
+        self.retune(replace(self.tuning, observer=ObserverTuning()))
+        return [("observer", f"tuning {self.tuning.name} has no observer, and no velocity is measured: the default "
+                 "observer estimates it, and an unknown force")]  # fmt: skip
 
     def _make_live(self) -> LiveLoop:
         return LiveLoop(self, self._asked(), self._sensors)

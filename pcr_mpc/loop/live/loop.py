@@ -87,6 +87,13 @@ class LiveLoop:
     asked : Asked
         Of the reference.
     sensors : Sensors
+
+    Attributes
+    ----------
+    k : int
+        The last period that was decided on.
+    notes : list of (kind, message)
+        To be told with the next decision.
     """
 
     def __init__(self, core: Core, asked: Asked, sensors: Sensors) -> None:
@@ -97,7 +104,7 @@ class LiveLoop:
         self._near = 0.05 * float(asked.robot.lengths.min()) + 10.0 * sensors.tip_noise
         self.k = -1  # the last period that was decided on
         self._wish = Wish()
-        self._notes: list[Event] = []
+        self.notes: list[Event] = []
         self._resting = False
         self._silent = [0, 0]  # periods in which nothing that the tip's sensor, and the encoders, said was believed
         self._seen: deque[tuple[int, np.ndarray, np.ndarray]] = deque(maxlen=_RETURNED)
@@ -107,7 +114,7 @@ class LiveLoop:
         """Stand in a pose; the next call of `step` is for period k."""
         self._clock.start()
         self.k = k - 1
-        self._wish, self._notes, self._resting, self._silent = Wish(), [], False, [0, 0]
+        self._wish, self.notes, self._resting, self._silent = Wish(), [], False, [0, 0]
         self._seen.clear()
         self._last = None
         self._stand(k, found, np.zeros(2))
@@ -143,24 +150,24 @@ class LiveLoop:
     def follow(self, path: Any, fading: float | None) -> None:
         """See `TrackingController.follow`."""
         trajectory, next_one = as_trajectory(path), self.k + 1
-        self._notes += self.reference.follow(trajectory, self._now(), next_one, fading)
+        self.notes += self.reference.follow(trajectory, self._now(), next_one, fading)
         self._wish = Wish(path=trajectory, start=next_one)
 
     def stop(self) -> None:
         """See `TrackingController.stop`."""
-        self._notes += self.reference.stop(self._now())
+        self.notes += self.reference.stop(self._now())
         self._wish = Wish()
 
     def hold(self) -> None:
         """See `TrackingController.hold`."""
         k = self._now()
         point = self.reference.state(k)[0]
-        self._notes += self.reference.hold(k)
+        self.notes += self.reference.hold(k)
         self._wish = Wish(point=point)
 
     def jog(self, velocity: Any) -> None:
         """See `TrackingController.jog`."""
-        self._notes += self.reference.jog(checked_vector("velocity", velocity, 2), self._now())
+        self.notes += self.reference.jog(checked_vector("velocity", velocity, 2), self._now())
         self._wish = Wish()
 
     def _now(self) -> int:
@@ -171,8 +178,8 @@ class LiveLoop:
         """See `TrackingController.step`."""
         reading = self._reading(tip, angles)
         tick = self._clock.tick(None if time is None else _number("time", time))
-        notes = [*self._notes, *tick.events]
-        self._notes = []
+        notes = [*self.notes, *tick.events]
+        self.notes = []
         if not tick.periods:
             # The rates go on, and with them all that was decided.
             assert self._last is not None
@@ -190,7 +197,7 @@ class LiveLoop:
 
     def decide(self, k: int, x: np.ndarray) -> Decision:
         """Decide on period k from a measured state, in a loop that counts its periods itself."""
-        notes, self._notes = self._notes, []
+        notes, self.notes = self.notes, []
         if k <= self.k or k < self.reference.first:
             raise PCRError(f"period {k} comes after period {self.k}, on the fly a reference only goes on; call start")
         self.k = k
