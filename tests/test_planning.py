@@ -256,6 +256,19 @@ def test_a_path_between_way_points_may_be_free(points_scene, planned):
 
 
 @pytest.mark.slow
+def test_rods_with_weight_are_planned_for_by_shooting(scene):
+    vertical = load_scene(MODELS / "scenes" / "vertical.toml")
+    heavy = replace(scene, robot=vertical.robot)
+    planned = plan_timing(heavy, cells=40)
+    assert planned.excess <= 1e-3
+    t = np.linspace(0.0, planned.duration, 801)
+    q = np.stack([eq.q for eq in motors(heavy.robot, planned, t, heavy.start())])
+    assert np.abs(np.diff(q, axis=0)).max() / t[1] <= 1.001 * heavy.robot.rate_limit
+    assert np.abs(np.diff(q, 2, axis=0)).max() / t[1] ** 2 <= 1.001 * heavy.robot.acceleration_limit
+    assert np.abs(q - scene.start().q).max() > 0.1
+
+
+@pytest.mark.slow
 def test_margins_and_torque_limit_too(scene):
     """A margin that the fastest motion does not leave is kept, and takes time."""
     limits = PlanLimits.of_scene(scene)

@@ -42,6 +42,15 @@ class Angles:
     pose: Equilibrium
 
 
+def followed(pose: Equilibrium, p: np.ndarray, q: np.ndarray, near: Equilibria | None) -> Equilibria:
+    """Held poses at many points, from poses near them, or where these do not lead there along the path from a pose."""
+    if near is not None:
+        poses = solve_statics_batch(pose.robot, p, q, guess=near)
+        if poses.solved.all():
+            return poses
+    return solve_statics_batch(pose.robot, p, q, guess=pose, along=True)
+
+
 def balanced(
     pose: Equilibrium, p: np.ndarray, force: np.ndarray, q: np.ndarray, near: Equilibria | None, tolerance: float
 ) -> tuple[Equilibria, np.ndarray]:
@@ -77,9 +86,7 @@ def balanced(
     steps = 0
     while steps < _MOST_STEPS:
         steps += 1
-        poses = solve_statics_batch(robot, p, q, guess=pose if near is None else near, along=near is None)
-        if near is not None and not poses.solved.all():
-            poses = solve_statics_batch(robot, p, q, guess=pose, along=True)
+        poses = followed(pose, p, q, near)
         missed = force - poses.force
         size = np.linalg.norm(missed, axis=1)
         lost = np.flatnonzero(~np.isfinite(size))
@@ -111,7 +118,7 @@ def angles(
     stiffness, levers = poses.dforce_dp, _levers(poses.dforce_dq)
     # Along x: K P' + G q' = F', with H = G^+. The slopes: K dP + G dq = dF at every x.
     first = f1 - p1.through(stiffness)
-    k1, h1 = _along(poses, p1.value, first.through(levers).value, levers)
+    k1, h1 = _along(pose, poses, p1.value, first.through(levers).value, levers)
     k2, h2 = _derivative(x, k1), _derivative(x, h1)
     push = f - p.through(stiffness)
     push1 = f1 - p.through(k1) - p1.through(stiffness)
@@ -134,11 +141,22 @@ def _levers(coupling: np.ndarray) -> np.ndarray:
     return np.linalg.inv(coupling) if coupling.shape[2] == 2 else np.linalg.pinv(coupling)
 
 
-def _along(poses: Equilibria, p1: np.ndarray, q1: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _along(
+    pose: Equilibrium, poses: Equilibria, p1: np.ndarray, q1: np.ndarray, levers: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of K and H at each pose where tip and motors move by p1 and q1: by differences, at the pose alone."""
     size = np.abs(np.concatenate([p1 / poses.robot.lengths.mean(), q1], axis=1)).max(axis=1)
     step = _STEP / np.maximum(size, _STEP)
-    there = solve_statics_batch(poses.robot, poses.p + step[:, None] * p1, poses.q + step[:, None] * q1, guess=poses)
+    there = followed(pose, poses.p + step[:, None] * p1, poses.q + step[:, None] * q1, poses)
+    if not there.solved.all():
+        row = int(np.argmin(there.solved))
+        raise ConvergenceError(
+            f"the rods could not be followed from p = {poses.p[row]} m: {there.reason[row]}; keep away from this pose",
+            residual=float("nan"),
+            iterations=0,
+            last=poses.q[row],
+            row=row,
+        )
     scale = 1.0 / step[:, None, None]
     return scale * (there.dforce_dp - poses.dforce_dp), scale * (_levers(there.dforce_dq) - levers)
 

@@ -12,9 +12,8 @@ from ...errors import check_numbers
 from ...linearisation.pose_limits import PoseLimits
 from ...loop.scene import Scene
 from ...plant.rods.chart import LEAST_CRITICAL_LOAD, critical_load
-from ...plant.statics.batch import solve_statics_batch
 from ...plant.statics.equilibria import Equilibria
-from .angles import Angles
+from .angles import Angles, followed
 from .linear import Linear
 from .motion import Motion
 
@@ -190,4 +189,4 @@ def _turned(turned: Angles, motors: int | slice) -> Equilibria:
     poses = turned.poses
     q = poses.q.copy()
     q[:, motors] += _ANGLE
-    return solve_statics_batch(poses.robot, poses.p, q, guess=poses)
+    return followed(turned.pose, poses.p, q, poses)
