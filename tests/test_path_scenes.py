@@ -34,7 +34,7 @@ def test_the_whole_path_is_followed(name):
     run = run_of(name)
     summary = run.summary()
     assert (summary["verdict"], summary["limit_violations"], summary["fallbacks"]) == ("", 0, 0)
-    assert summary["pose_violations"] == {"torque": 0, "rod margin": 0, "stiffness": 0}
+    assert not any(summary["pose_violations"].values())
     assert summary["rms_after_1s_mm"] < SCENES[name]
     assert summary["final_error_mm"] < SCENES[name]
     assert run.scene.trajectory.duration <= run.t[-1]

@@ -27,7 +27,7 @@ def test_python_example(monkeypatch, capsys):
 )
 def test_links_and_pictures_exist(page):
     links = re.findall(r"\[.*?\]\((.*?)\)", page.read_text())
-    assert links or page.name in ("commands.md", "glossary.md", "reference.md")
+    assert links or page.parent.name == "docs"  # a page may have none, the README has some
     for link in links:
         target = page.parent / link.partition("#")[0]
         assert target.stat().st_size > (5_000 if target.suffix in (".png", ".gif") else 0), link
