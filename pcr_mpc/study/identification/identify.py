@@ -146,7 +146,8 @@ def _delay(scene: Scene, logs: Sequence[Log]) -> float | None:
 def _fits(predictor: Predictor, found: Found, scene: Scene) -> tuple[Fit, ...]:
     believed = found.problem.parameters
     values = believed.values(np.zeros(len(believed.free)))
-    before = held_fit(predictor, found.problem.parameters, values | {"delay": float(scene.delay)}, found.problem.noise)
+    before = held_fit(predictor, found.problem.parameters, values | {"delay": float(scene.delay)}, found.problem.noise,
+                      fine=False)  # fmt: skip
     readings, noise = found.readings, found.problem.noise
     fits = []
     for i, log in enumerate(predictor.logs):

@@ -222,16 +222,22 @@ class _Search:
 
     def _stepped(self, problem: Problem, guess: Guess) -> bool:
         """Learn what the scene's own steps make different; return whether that is known already."""
+        if self.corrections is not None and self._largest(self.corrections) < _SETTLED:
+            return True  # so is any change of it
         arguments = self.parameters, guess.z, guess.missing, self.pieces, guess.starts
         fine = self.predictor.states(*arguments, fine=True)
         coarse = self.predictor.states(*arguments)
         old = self.corrections or [np.zeros_like(x) for x in coarse]
         self.corrections = [a - b for a, b in zip(fine, coarse, strict=True)]
-        change = max(
-            float(np.abs(new - before)[:, :2].max()) / self.noise[piece.log].tip
-            for new, before, piece in zip(self.corrections, old, self.pieces, strict=True)
+        changes = [new - before for new, before in zip(self.corrections, old, strict=True)]
+        return self._largest(changes) < _SETTLED
+
+    def _largest(self, changes: Sequence[np.ndarray]) -> float:
+        """Of changes of the pieces' states, that of the tip, in standard deviations of its readings."""
+        return max(
+            float(np.abs(change[:, :2]).max()) / self.noise[piece.log].tip
+            for change, piece in zip(changes, self.pieces, strict=True)
         )
-        return change < _SETTLED
 
 
 def held_fit(
@@ -239,10 +245,12 @@ def held_fit(
     parameters: Parameters,
     values: Mapping[str, float],
     noise: Sequence[Noise] | None,
+    *,
+    fine: bool = True,
 ) -> Readings | None:
     """Predict logs with given numbers, from the starts that suit best; None where the rods do not follow.
 
-    Without noise residuals are in metres and radians.
+    With ``fine`` in the scene's own steps. Without noise residuals are in metres and radians.
     """
     held = replace(parameters, free=(), held=dict(values), root=np.zeros((0, 0)))
     pieces = pieces_of(predictor.logs, skipped(predictor, values["delay"]), None)
@@ -252,7 +260,7 @@ def held_fit(
     try:
         problem = Problem(predictor, held, pieces, [size] * len(predictor.logs), guess, robust=True)
         vector = solve(problem, problem.packed(guess), enough=1e-2).vector
-        states = predictor.states(held, np.zeros(0), guess.missing, pieces, problem.unpacked(vector).starts, fine=True)
+        states = predictor.states(held, np.zeros(0), guess.missing, pieces, problem.unpacked(vector).starts, fine=fine)
     except (PCRError, IdentificationError):
         return None
     problem.noise = tuple(noise or [Noise(1.0, 1.0)] * len(predictor.logs))

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import qr
 
 from ... import interrupt
 from ...errors import IdentificationError, PCRError
@@ -63,8 +62,9 @@ def solve(
         interrupt.check()
         weights = problem.weights(residuals)
         weighted = weights[:, None] * jacobian
-        orthogonal, triangle = qr(weighted, mode="economic", check_finite=False)
-        target = -orthogonal.T @ (weights * residuals)
+        # With the residuals beside it: their part in the Jacobian's range comes for nothing.
+        factor = np.asarray(np.linalg.qr(np.column_stack([weighted, -weights * residuals]), "r"))[: len(vector)]
+        triangle, target = factor[:, :-1], factor[:, -1]
         size = np.maximum(np.linalg.norm(triangle, axis=0), 1e-12)
         while True:
             step = np.linalg.lstsq(
