@@ -178,6 +178,7 @@ def test_jerk_is_limited_by_option(light):
     assert planned.duration <= 1.02 * best
 
 
+@pytest.mark.slow
 def test_it_is_as_fast_as_toppra_where_only_rates_and_accelerations_count(light):
     toppra = pytest.importorskip("toppra")
     toppra.setup_logging("ERROR")
