@@ -23,7 +23,7 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 RECORDS = ROOT / "docs" / "records"
 _MARK = re.compile(
-    r"(<!--figure (?P<record>\S+) (?P<keys>\S+) (?P<form>\S+?)(?: (?P<factor>\S+?))?-->)(?P<text>.*?)(<!--/-->)"
+    r"(<!--figure (?P<record>\S+) (?P<keys>\S+) (?P<form>\S*?)(?: (?P<factor>\S+?))?-->)(?P<text>.*?)(<!--/-->)"
 )
 
 

@@ -1,33 +1,64 @@
-"""The README's Python example runs, and prints what its comments say."""
+"""README and pages: their Python runs, the tutorial's commands do, and links lead somewhere."""
 
 import re
+import shlex
 
 import numpy as np
 import pytest
 
+from pcr_mpc import cli
+
 from .conftest import ROOT
 
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NO_LINKS = ("commands.md", "glossary.md", "reference.md")
 
-def test_python_example(monkeypatch, capsys):
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(blocks) == 1
-    monkeypatch.chdir(ROOT)
-    names: dict[str, object] = {}
-    exec(blocks[0], names)
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].endswith("True")
-    assert np.allclose(np.fromstring(lines[0].split("]")[0].strip("[ "), sep=" "), [3.367, -0.225], atol=1e-3)
-    said = re.search(r'final_error_mm"\]\)  # (\S+)\n', blocks[0])
+
+def blocks(page, language):
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
+def test_python_runs(page, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for block in blocks(page, "python"):
+        exec(block, names)
+
+
+def test_readme_prints_what_it_says(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    (block,) = blocks(ROOT / "README.md", "python")
+    exec(block, {})
+    said = re.search(r"print\(.*# (\S+)\n", block)
     assert said
-    assert 1 / 3 < float(lines[-1]) / float(said[1]) < 3
+    assert np.isclose(float(capsys.readouterr().out), float(said[1]), atol=5e-5)
 
 
-@pytest.mark.parametrize(
-    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name
-)
+@pytest.mark.slow
+def test_tutorial_to_the_letter(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = ROOT / "docs" / "new_robot.md"
+    commands = [line for block in blocks(page, "") for line in block.splitlines()]
+    assert [line.split()[1] for line in commands] == ["new", "new", "check", "track"]
+    for line in commands:
+        status = cli.main(shlex.split(line)[1:])
+        said = capsys.readouterr()
+        # The second one shows a robot that cannot be.
+        assert (status == 0) == (" stiff " not in line), said.err
+    for table in ("rods        2 of nitinol", "nearest that works: 1.5 mm diameter"):
+        assert table in page.read_text(encoding="utf-8")
+    assert {path.name for path in (tmp_path / "results" / "mine").iterdir()} >= {"run.npz", "track.png", "track.gif"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_pictures_exist(page):
-    links = re.findall(r"\[.*?\]\((.*?)\)", page.read_text())
-    assert links or page.parent.name == "docs"  # a page may have none, the README has some
+    links = re.findall(r"\[.*?\]\((.*?)\)", page.read_text(encoding="utf-8"))
+    assert links or page.name in NO_LINKS
     for link in links:
         target = page.parent / link.partition("#")[0]
         assert target.stat().st_size > (5_000 if target.suffix in (".png", ".gif") else 0), link
+
+
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
