@@ -11,14 +11,18 @@ from pcr_mpc import cli
 from .conftest import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-NO_LINKS = ("commands.md", "glossary.md", "reference.md")
+RUN_ELSEWHERE = ("README.md", "your_loop.md")  # below, and in test_your_loop
 
 
 def blocks(page, language):
     return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if blocks(page, "python") and page.name not in RUN_ELSEWHERE],
+    ids=lambda page: page.name,
+)
 def test_python_runs(page, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     names = {}
@@ -53,9 +57,7 @@ def test_tutorial_to_the_letter(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_pictures_exist(page):
-    links = re.findall(r"\[.*?\]\((.*?)\)", page.read_text(encoding="utf-8"))
-    assert links or page.name in NO_LINKS
-    for link in links:
+    for link in re.findall(r"\[.*?\]\((.*?)\)", page.read_text(encoding="utf-8")):
         target = page.parent / link.partition("#")[0]
         assert target.stat().st_size > (5_000 if target.suffix in (".png", ".gif") else 0), link
 
