@@ -44,7 +44,6 @@ class Units:
                 line_density=self.mass / self.length * rod.line_density,
                 curvature=tuple(kappa / self.length for kappa in rod.curvatures),
                 axial_stiffness=self.force * rod.axial_stiffness,
-                half_thickness=rod.half_thickness and self.length * rod.half_thickness,
             )
             for rod in robot.rods
         ]

@@ -142,7 +142,7 @@ def test_rods_that_count_and_are_left_out_are_a_warning(scene, found):
 
 
 def test_a_wire_beyond_its_strain_is_an_error(scene):
-    thick = tuple(replace(rod, half_thickness=0.00075, strain_limit=0.007) for rod in scene.robot.rods)
+    thick = tuple(replace(rod, thickness_ratio=0.00075 / rod.length, strain_limit=0.007) for rod in scene.robot.rods)
     found = examine(still(scene, robot=replace(scene.robot, rods=thick)), modes=False)
     assert {level for level, _ in about(found, "strain")} == {"error"}
     # 1.5 mm at 15 /m, which models/README.md reckons: 1.1 %.

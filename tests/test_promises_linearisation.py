@@ -143,7 +143,7 @@ def test_nothing_asked_is_nothing_watched(pair, centre):
 
 
 def test_combinations_are_all_that_rows_may_give(pair):
-    strips = replace(pair, rods=tuple(replace(rod, half_thickness=1e-3) for rod in pair.rods))
+    strips = replace(pair, rods=tuple(replace(rod, thickness_ratio=1e-3 / rod.length) for rod in pair.rods))
     watch = LimitWatch(PoseLimits(1.0, (-1, -1), (1, 1), 0.1, 1.0, 0.01), Plant(strips))
     found = watch.combinations()
     assert len(found) == len(set(found)) == 2**5 - 1

@@ -31,8 +31,9 @@ HALF = 0.4e-3
 
 
 def thick(robot, half_thickness=HALF, limit=0.0085):
-    rods = tuple(replace(rod, half_thickness=half_thickness, strain_limit=limit) for rod in robot.rods)
-    return replace(robot, rods=rods)
+    ratios = [half_thickness and half_thickness / rod.length for rod in robot.rods]
+    pairs = zip(robot.rods, ratios, strict=True)
+    return replace(robot, rods=tuple(replace(rod, thickness_ratio=h, strain_limit=limit) for rod, h in pairs))
 
 
 def integrated(rod, eq, i, points=2001):

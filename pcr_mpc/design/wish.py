@@ -89,7 +89,7 @@ class Wish:
                 bending_stiffness=material.youngs_modulus * section.second_moment,
                 line_density=material.density * section.area,
                 angle_limits=stops,
-                half_thickness=section.half_thickness,
+                thickness_ratio=section.half_thickness / self.length,
                 strain_limit=material.strain_limit,
             )
             for base, stops in zip(layout.bases, layout.angle_limits, strict=True)

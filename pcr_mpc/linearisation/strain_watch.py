@@ -43,7 +43,7 @@ class StrainWatch:
         physics = None if plant.method == "closed_form" else robot_physics(plant.robot)
         self._physics: tuple[RodPhysics, ...] | None = physics
         self._at_nodes: dict[int, BufferedFunction] = {}
-        self._ratios = [(rod.half_thickness or math.nan) / rod.length for rod in plant.robot.rods]
+        self._ratios = [rod.thickness_ratio or math.nan for rod in plant.robot.rods]
 
     @property
     def count(self) -> int:

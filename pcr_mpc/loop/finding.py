@@ -14,7 +14,7 @@ from .references.reading import built_in
 from .scene import Scene
 from .trajectory import sampled
 
-_MOVES_NOTHING = ("half_thickness", "strain_limit")
+_MOVES_NOTHING = ("thickness_ratio", "strain_limit")
 
 
 def digest(scene: Scene) -> str:

@@ -53,9 +53,10 @@ class Rod:
         EI(s)/EI, likewise.
     axial_stiffness : float
         EA [N]; infinite for a rod that does not stretch.
-    half_thickness : float or None
-        Distance of the outermost fibre from the neutral line [m], the same all along the rod; its strain is
-        ``|kappa - kappa0|`` times that. None: not known, and no strain is.
+    thickness_ratio : float or None
+        Distance of the outermost fibre from the neutral line over the length [-], the same all along the rod; its
+        strain is ``|kappa - kappa0| L`` times that. None: not known, and no strain is. A ratio, so that a rod that is
+        made longer or shorter keeps its proportions.
     strain_limit : float
         Largest strain that the material bears [-]; infinite if it is not known.
     """
@@ -68,7 +69,7 @@ class Rod:
     curvature: float | tuple[float, ...] = 0.0
     stiffness_factors: tuple[float, ...] = (1.0,)
     axial_stiffness: float = math.inf
-    half_thickness: float | None = None
+    thickness_ratio: float | None = None
     strain_limit: float = math.inf
 
     def __post_init__(self) -> None:
@@ -92,14 +93,15 @@ class Rod:
             )
 
     def _check_strain(self) -> None:
-        if self.half_thickness is not None:
-            check_numbers(self, {"half_thickness": POSITIVE})
-            if 2.0 * self.half_thickness > _STOUT * self.length:
-                raise ModelError(_stout(2.0 * self.half_thickness, self.length), key="half_thickness")
+        if self.thickness_ratio is not None:
+            check_numbers(self, {"thickness_ratio": POSITIVE})
+            if 2.0 * self.thickness_ratio > _STOUT:
+                thickness = 2.0 * self.thickness_ratio * self.length
+                raise ModelError(_stout(thickness, self.length), key="thickness_ratio")
         if self.strain_limit != math.inf:
             check_numbers(self, {"strain_limit": {"above": 0.0}})
             check_unit("strain_limit", self.strain_limit)
-            if self.half_thickness is None:
+            if self.thickness_ratio is None:
                 raise ModelError(
                     "strain_limit: without the thickness of the rod no strain is known; state its section too",
                     key="strain_limit",
@@ -111,10 +113,15 @@ class Rod:
         own = {
             "bending_stiffness": material.youngs_modulus * section.second_moment,
             "line_density": material.density * section.area,
-            "half_thickness": section.half_thickness,
             "strain_limit": material.strain_limit,
         }
-        return cls(**own | others)
+        length = checked_number("length", others.get("length"), **POSITIVE)
+        return cls(**own | {"thickness_ratio": section.half_thickness / length} | others)
+
+    @property
+    def half_thickness(self) -> float | None:
+        """Distance of the outermost fibre from the neutral line [m]; None if it is not known."""
+        return None if self.thickness_ratio is None else self.thickness_ratio * self.length
 
     @property
     def curvatures(self) -> tuple[float, ...]:
@@ -170,7 +177,7 @@ def read_rod(table: Table) -> Rod:
     ModelError
         A key is missing, of the wrong type, out of range or of another unit, or two of them contradict each other.
     """
-    base, length = table.vector("base", 2), table.number("length")
+    base, length = table.vector("base", 2), table.number("length", **POSITIVE)
     material = _read_material(table)
     section = _read_section(table, length)
     if section is None and (given := [name for name, value in material.items() if value is not None]):
@@ -195,7 +202,7 @@ def read_rod(table: Table) -> Rod:
         curvature=table.profile("curvature", 0.0),
         stiffness_factors=table.profile("stiffness_factors", (1.0,)),
         axial_stiffness=table.number("axial_stiffness", math.inf),
-        half_thickness=half_thickness,
+        thickness_ratio=None if half_thickness is None else half_thickness / length,
         strain_limit=material["strain_limit"] or math.inf,
     )
 

@@ -52,17 +52,17 @@ def strain_along(rod: Rod, nodes: np.ndarray, physics: RodPhysics | None, n_poin
         None: a plain rod.
     n_points : int
     """
-    if rod.half_thickness is None:
+    if rod.thickness_ratio is None:
         return np.full(n_points, np.nan)
     _, _, theta, n_x, n_y, m = sample_rod(nodes, n_points, physics)
     if physics is None:
-        return np.asarray(rod.half_thickness / rod.length * np.abs(m))
+        return np.asarray(rod.thickness_ratio * np.abs(m))
     _, compliance, _, factors = unpacked(physics.layout, physics.values)
     bend = m
     if factors is not None:
         bend = m / np.interp(np.linspace(0.0, 1.0, n_points), np.linspace(0.0, 1.0, len(factors)), factors)
     stretch = compliance * (n_x * np.cos(theta) + n_y * np.sin(theta))
-    return np.asarray(np.abs(stretch) + rod.half_thickness / rod.length * np.abs(bend))
+    return np.asarray(np.abs(stretch) + rod.thickness_ratio * np.abs(bend))
 
 
 def largest_strain(rod: Rod, nodes: np.ndarray, physics: RodPhysics) -> tuple[float, float]:

@@ -189,13 +189,13 @@ class Equilibrium(Frozen):
         """Largest strain of each rod, shape (n,) [-], exact for plain rods; NaN where no thickness is known."""
         found = np.full(self.robot.n_rods, np.nan)
         for i, (rod, physics) in enumerate(zip(self.robot.rods, self.physics, strict=True)):
-            if rod.half_thickness is None:
+            if rod.thickness_ratio is None:
                 continue
             if physics is None:
                 unit = rod.bending_stiffness / rod.length**2
                 n_x, n_y = (self.rod_forces[i] / unit).tolist()
                 m = float(self.motor_torque[i]) / (unit * rod.length)
-                found[i] = rod.half_thickness / rod.length * largest_moment(float(self.q[i]), n_x, n_y, -m)
+                found[i] = rod.thickness_ratio * largest_moment(float(self.q[i]), n_x, n_y, -m)
             else:
                 found[i] = largest_strain(rod, self.nodes[i], physics)[1]
         return read_only(found)
