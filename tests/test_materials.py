@@ -205,12 +205,12 @@ def test_megapascals_are_questioned(robot_file):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"half_thickness": 0.05}, "0.1 m thick and 0.4 m long"),
-        ({"half_thickness": 0.0}, "half_thickness"),
-        ({"half_thickness": math.nan}, "half_thickness"),
+        ({"thickness_ratio": 0.125}, "0.1 m thick and 0.4 m long"),
+        ({"thickness_ratio": 0.0}, "thickness_ratio"),
+        ({"thickness_ratio": math.nan}, "thickness_ratio"),
         ({"strain_limit": 0.01}, "without the thickness"),
-        ({"half_thickness": 1e-3, "strain_limit": 1.0}, "not per cent"),
-        ({"half_thickness": 1e-3, "strain_limit": -0.01}, "strain_limit"),
+        ({"thickness_ratio": 2.5e-3, "strain_limit": 1.0}, "not per cent"),
+        ({"thickness_ratio": 2.5e-3, "strain_limit": -0.01}, "strain_limit"),
     ],
 )
 def test_rods_with_strain_that_cannot_be(change, words):
