@@ -51,8 +51,8 @@ from pcr_mpc.report.tables import table
 ROOT = Path(__file__).parent.parent
 KEPT = ROOT / "docs" / "benchmarks.json"
 WORST = 0.5  # of the old ratio
-# What is promised of what Python adds to the graph that solves a pose: 1.5 and 0.1 of the 28 us that the graph took when
-# that was promised. It takes 10 us since, so that the same microseconds are a larger share of it.
+# What Python may add to the graph that solves a pose: 1.5 and 0.1 of the 28 us that the graph took when that was
+# promised. It takes 10 us since, so that the same microseconds are a larger share of it.
 PROMISED = {
     "statics: graph alone / solve_statics warm": 1 / 5,
     "statics: graph alone / solve_statics_batch": 1 / 1.4,
