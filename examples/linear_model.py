@@ -3,9 +3,9 @@
 import control
 import numpy as np
 
-from pcr_mpc import Plant, inverse_statics, linearise, load_robot
+from pcr_mpc import Plant, inverse_statics, linearise, load_robot, shipped
 
-robot = load_robot("models/planar_pair.toml")
+robot = load_robot(shipped("planar_pair", "robot"))
 rest = inverse_statics(robot, (0.05, 0.27), mode="LR")
 x = np.concatenate([rest.p, (0.0, 0.0), rest.q])  # [p, v, q]
 plant = Plant(robot)

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pcr_mpc import Plant, inverse_statics, load_robot, rollout, sensitivities
+from pcr_mpc import Plant, inverse_statics, load_robot, rollout, sensitivities, shipped
 
-robot = load_robot("models/planar_pair.toml")
+robot = load_robot(shipped("planar_pair", "robot"))
 rest = inverse_statics(robot, (0.0, 0.25), mode="LR")
 x0 = np.concatenate([rest.p, (0.0, 0.0), rest.q])
 inputs = np.tile((0.5, -0.3), (300, 1))  # motor rates [rad/s], 0.3 s at 1 ms

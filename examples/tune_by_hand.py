@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-from pcr_mpc import load_scene, load_tuning, make_controller, simulate
+from pcr_mpc import load_scene, load_tuning, make_controller, shipped, simulate
 
-scene = replace(load_scene("models/scenes/lemniscate.toml"), duration=2.0)
-tuning = load_tuning("controllers/default.toml")
+scene = replace(load_scene(shipped("lemniscate")), duration=2.0)
+tuning = load_tuning(shipped("default", "tuning"))
 for weight in (1e-3, 1e-2, 1e-1):
     controller = make_controller(scene, replace(tuning, input_weight=weight))
     run = simulate(scene, scene.make_plant(), controller)

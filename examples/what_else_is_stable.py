@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pcr_mpc import all_equilibria, distance_to_fold, inverse_statics, load_robot
+from pcr_mpc import all_equilibria, distance_to_fold, inverse_statics, load_robot, shipped
 
-robot = load_robot("models/planar_pair.toml")
+robot = load_robot(shipped("planar_pair", "robot"))
 rest = inverse_statics(robot, (0.0, 0.25), mode="LR")
 
 for eq in all_equilibria(robot, q=rest.q):
