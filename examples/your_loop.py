@@ -25,5 +25,6 @@ for k in range(300):
     decision = controller.step(tip=tip, angles=x[4:], time=0.01 * k)
     for event in decision.events:
         print(f"{0.01 * k:.2f} s: {event['kind']}: {event['message']}")
+    error = np.hypot(*(x[:2] - controller.target[0]))  # [m]
     x = plant.step(x, decision.u)
-print(f"off by {1e3 * np.hypot(*(x[:2] - controller.target[0])):.3f} mm at the end")
+print(f"off by {1e3 * error:.3f} mm at the end")
