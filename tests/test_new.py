@@ -188,7 +188,7 @@ def test_motors_too_far_apart_are_refused(capsys, tmp_path):
 
 SPREAD = [
     {"rods": 2, "material": "nitinol_linear", "diameter": 2.1e-4, "length": 0.15, "spacing": 0.15},
-    {"rods": 2, "material": "gfrp", "diameter": 6e-3, "length": 1.6},
+    {"rods": 2, "material": "gfrp", "diameter": 5e-3, "length": 1.6},
     {"rods": 2, "material": "spring_steel", "diameter": 1.0e-3, "length": 0.4},
     {"rods": 3, "material": "gfrp", "diameter": 8.4e-4, "length": 0.49, "spacing": 0.23},
     {"rods": 4, "material": "titanium", "diameter": 3.7e-3, "length": 0.74},
