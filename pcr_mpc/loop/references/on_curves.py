@@ -5,6 +5,7 @@ None of them rests at its ends by itself unless it says so: `Blended` sees to th
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,13 +20,13 @@ _POSITIVE = {"above": 0.0}
 _PEAK = 15 / 8  # largest over mean rate of a quintic from rest to rest
 
 
-class OnCurve:
+class OnCurve(ABC):
     """Base of trajectories that go along a curve, and stay at its end."""
 
     @property
+    @abstractmethod
     def curve(self) -> Curve:
         """Where it leads, by arc length."""
-        raise NotImplementedError
 
     @property
     def duration(self) -> float:
@@ -40,9 +41,9 @@ class OnCurve:
         return np.stack([place, along * rate, bend * rate**2 + along * change], axis=1)
 
     @property
+    @abstractmethod
     def _knots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times [s], arc lengths [m] and rates [m/s] at which there is no change of rate."""
-        raise NotImplementedError
 
     def _progress(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Arc length [m], its rate [m/s] and that one's change [m/s^2]: quintics from knot to knot.
@@ -225,9 +226,9 @@ class _ThroughPoints(OnCurve):
         return False
 
     @property
+    @abstractmethod
     def curve(self) -> Rounded | Smooth:
         """See `OnCurve`."""
-        raise NotImplementedError
 
     @cached_property
     def _knots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
