@@ -26,6 +26,8 @@ def digest(scene: Scene) -> str:
     kept = ("robot", "duration", "start_tip", "start_motors", "start_mode", "start_velocity", "plant",
             "period", "force", "delay", "payload", "need")  # fmt: skip
     facts = {name: _facts(getattr(scene, name)) for name in kept}
+    if scene.untold_delay:
+        facts["untold_delay"] = _facts(scene.untold_delay)
     facts["trajectory"] = own_motion(scene) or _facts(scene.trajectory)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
 

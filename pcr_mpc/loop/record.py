@@ -29,7 +29,7 @@ ARRAYS = {
     "t": "times of the plant's steps, K + 1 [s]",
     "x": "states at t: tip position (2) [m], tip velocity (2) [m/s], motor angles (n) [rad]",
     "reference": "wanted tip positions at t [m]",
-    "applied": "motor rates that each of the K plant steps got, after the scene's delay and lateness [rad/s]; "
+    "applied": "motor rates that each of the K plant steps got, after the scene's delays and lateness [rad/s]; "
     "a motor at its stop does not follow them",
     "u": "motor rates as decided in each of the M control periods; the motors get them the scene's delay later "
     "(see applied) [rad/s]",

@@ -28,6 +28,7 @@ from .finding import verified
 from .record import ARRAYS, FORMAT, from_text, record, write_csv
 from .scene import Scene
 from .settings import PlantSettings
+from .untold_delay import UntoldDelay
 
 # Commands within this of a limit keep it: rounding for rates, relative to it, the QP's tolerance for angles [rad].
 _LIMIT_SLACK = 1e-9
@@ -141,9 +142,15 @@ class Run(Frozen):
         robot, period = self.scene.robot, self.scene.period
         change = np.diff(self.u, axis=0, prepend=np.zeros((1, robot.n_rods)))
         # Where the command leads from when it arrives, not where the motor's stop lets it get.
-        starts = self.x[self.scene.delay * self.steps_per_period :: self.steps_per_period, 4:][: len(self.u)]
-        angles = starts + period * self.u[: len(starts)]
+        later = UntoldDelay(self.scene.untold_delay, self.dt, robot.n_rods)
+        first = self.scene.delay * self.steps_per_period + later.steps
+        starts = self.x[first :: self.steps_per_period, 4:][: len(self.u)]
         lower, upper = robot.angle_limits.T
+        if later.fraction:  # the command before has the rest of a step
+            before = np.vstack([np.zeros(robot.n_rods), self.u])[: len(starts)]
+            moved = starts + later.fraction * self.dt * before
+            starts = np.clip(moved, np.minimum(lower, starts), np.maximum(upper, starts))
+        angles = starts + period * self.u[: len(starts)]
         broken = np.abs(self.u).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.rate_limit
         broken |= np.abs(change).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.acceleration_limit * period
         # Coming back from beyond a stop breaks nothing.

@@ -66,6 +66,8 @@ class Scene:
         Resolution of the encoders: measured angles are whole multiples of it [rad]. Zero: exact.
     delay : int
         Control periods that pass before a command reaches the motors.
+    untold_delay : float
+        Time beside it by which they get commands later than any controller was told [s]; need not be whole periods.
     deadline : float
         Time after the start of a period [s] up to which a decision still counts as taken at its start, at most the
         period. A later one reaches the motors as late as it is, but no later than at the end of its period. Infinite:
@@ -111,6 +113,7 @@ class Scene:
     own_period: float | None = None
     wrapped: bool = False
     tracking_error: float | None = None
+    untold_delay: float = 0.0
 
     @property
     def allowed_error(self) -> float:
@@ -275,6 +278,7 @@ def load_scene(path: str | Path) -> Scene:
             duration = _duration(file, trajectory, period)
             tuning = control.text("tuning", None)
             delay = control.integer("delay", 0, minimum=0)
+            untold_delay = control.number("untold_delay", 0.0, minimum=0.0)
             deadline = control.number("deadline", math.inf, minimum=0.0)
             late = control.text("late", LATE[0], choices=LATE)
         with file.table("load", {}) as load, file.table("sensor", {}) as sensor:
@@ -287,7 +291,7 @@ def load_scene(path: str | Path) -> Scene:
         scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                       tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
                       delay, deadline, late, pose_limits, payload, need, finding,
-                      wrapped=wrapped, tracking_error=tracking_error)  # fmt: skip
+                      wrapped=wrapped, tracking_error=tracking_error, untold_delay=untold_delay)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

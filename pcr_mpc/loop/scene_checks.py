@@ -30,7 +30,7 @@ def check_scene(scene: Any) -> None:
     check_numbers(
         scene,
         {"duration": {"above": 0.0}, "period": {"above": 0.0}, "tip_noise": {"minimum": 0.0},
-         "angle_step": {"minimum": 0.0}},
+         "angle_step": {"minimum": 0.0}, "untold_delay": {"minimum": 0.0}},
     )  # fmt: skip
     if scene.own_period is not None:
         check_numbers(scene, {"own_period": {"above": 0.0}})

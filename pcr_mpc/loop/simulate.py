@@ -25,6 +25,7 @@ from .record import versions
 from .run import Run
 from .scene import Scene
 from .simulated_plant import SimulatedPlant
+from .untold_delay import UntoldDelay
 
 
 def simulate(
@@ -86,6 +87,7 @@ def simulate(
     # Rates, how many steps late they come, and what the plan foresaw for the period after.
     still = np.zeros(scene.robot.n_rods)
     on_the_way = deque([(still, 0, still)] * scene.delay)
+    later = UntoldDelay(scene.untold_delay, plant.dt, n)
 
     states = np.empty((n_periods * per + 1, len(x)))
     inputs = np.empty((n_periods, n))
@@ -197,7 +199,7 @@ def simulate(
             arrived, waiting, after = on_the_way.popleft()
             for j in range(per):
                 interrupt.check()
-                u = meanwhile if j < waiting else arrived
+                u = later(meanwhile if j < waiting else arrived)
                 if done in changes:
                     x = plant.carry(float(payloads[done]), x)
                 applied[done] = u
