@@ -17,7 +17,9 @@ if TYPE_CHECKING:
         AmbiguousPoseError,
         CompilerError,
         ConvergenceError,
+        IdentificationError,
         InfeasibleError,
+        LogError,
         MeasurementError,
         ModelError,
         PCRError,
@@ -51,9 +53,14 @@ if TYPE_CHECKING:
     from .plant.statics.free_tip import forward_statics, inverse_statics
     from .plant.statics.held_tip import solve_statics
     from .plant.statics.stability import Stability, all_equilibria, assess_stability, distance_to_fold
+    from .plant.uncertainty import Uncertainty, load_uncertainty
     from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
     from .report.tables import equilibria_table, equilibrium_table, summary_table
     from .study.episodes import Spread, run_episode, simulate_episode
+    from .study.excitation import Excitation, excite
+    from .study.identification.identify import identify
+    from .study.identification.log import Log, read_log
+    from .study.identification.result import Identification
     from .study.planning.limits import PlanLimits
     from .study.planning.plan import plan_timing
     from .study.planning.timed_path import TimedPath
@@ -69,14 +76,19 @@ __all__ = [
     "Decision",
     "Equilibria",
     "Equilibrium",
+    "Excitation",
     "Hold",
     "HoldMotors",
+    "Identification",
+    "IdentificationError",
     "InfeasibleError",
     "Lemniscate",
     "Limits",
     "Line",
     "LinearMPC",
     "LinearModel",
+    "Log",
+    "LogError",
     "Material",
     "MeasurementError",
     "ModelError",
@@ -105,6 +117,7 @@ __all__ = [
     "TrackingController",
     "Trajectory",
     "Tuning",
+    "Uncertainty",
     "UnreachableError",
     "UnstableError",
     "Waypoints",
@@ -116,7 +129,9 @@ __all__ = [
     "distance_to_fold",
     "equilibria_table",
     "equilibrium_table",
+    "excite",
     "forward_statics",
+    "identify",
     "inverse_statics",
     "linearise",
     "load_path",
@@ -124,11 +139,13 @@ __all__ = [
     "load_run",
     "load_scene",
     "load_tuning",
+    "load_uncertainty",
     "make_controller",
     "plan_timing",
     "plot_equilibria",
     "plot_equilibrium",
     "plot_run",
+    "read_log",
     "rollout",
     "run_episode",
     "sensitivities",
@@ -150,7 +167,9 @@ _WHERE = {
         "AmbiguousPoseError",
         "CompilerError",
         "ConvergenceError",
+        "IdentificationError",
         "InfeasibleError",
+        "LogError",
         "MeasurementError",
         "ModelError",
         "PCRError",
@@ -186,7 +205,12 @@ _WHERE = {
     "plant.statics.batch": ("solve_statics_batch",),
     "report.plots": ("animate_run", "plot_equilibria", "plot_equilibrium", "plot_run"),
     "report.tables": ("equilibria_table", "equilibrium_table", "summary_table"),
+    "plant.uncertainty": ("Uncertainty", "load_uncertainty"),
     "study.episodes": ("Spread", "run_episode", "simulate_episode"),
+    "study.excitation": ("Excitation", "excite"),
+    "study.identification.identify": ("identify",),
+    "study.identification.log": ("Log", "read_log"),
+    "study.identification.result": ("Identification",),
     "study.planning.limits": ("PlanLimits",),
     "study.planning.plan": ("plan_timing",),
     "study.planning.timed_path": ("TimedPath",),

@@ -2,6 +2,7 @@
 
 import csv as csv_module
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from pcr_mpc import Plant, load_robot, load_scene, rollout
 from pcr_mpc.cli import main
 from pcr_mpc.errors import IdentificationError, LogError
 from pcr_mpc.plant.uncertainty import load_uncertainty
+from pcr_mpc.study.identification.balance import imbalance
 from pcr_mpc.study.identification.first_guess import first_guess, pieces_of
 from pcr_mpc.study.identification.identify import identify
 from pcr_mpc.study.identification.log import Log, read_log
@@ -184,12 +186,36 @@ def test_logs_that_are_too_short_or_still(scene, log):
         identify(scene, [still])
 
 
-@pytest.mark.slow
-def test_a_log_of_another_robot_is_refused(scene, log):
-    """Mirrored: angles and reach are possible, the motion is not."""
-    other = changed(log, p=lambda p: p * (-1.0, 1.0))
-    with pytest.raises(IdentificationError, match=r"hardly a log of planar_pair|no convergence"):
-        identify(scene, [noisy(other)], free=["bending_stiffness", "tip_mass", "drag", "delay"])
+MIRRORED = {
+    "tip": ({"p": lambda p: p * (-1.0, 1.0)}, "p_x_m had the other sign or if left and right of the motors"),
+    "upside down": ({"p": lambda p: p * (1.0, -1.0) + (0.0, 0.5)}, "check geometry"),
+    "motors": ({"q": lambda q: np.pi - q[:, ::-1], "u": lambda u: -u[:, ::-1]}, "p_x_m had the other sign or if left"),
+    "counting": ({"q": lambda q: -q, "u": lambda u: -u}, "angles and rates had the other sign"),
+}
+
+
+@pytest.mark.parametrize("kind", MIRRORED)
+def test_a_mirrored_log_is_refused_before_any_search(scene, log, kind, monkeypatch):
+    """Units, angles and reach are possible, the motion is not; by statics at some of its poses."""
+    monkeypatch.setattr("pcr_mpc.study.identification.identify.search", lambda *_, **__: pytest.fail("searched"))
+    changes, words = MIRRORED[kind]
+    with pytest.raises(IdentificationError, match=rf"hardly a log of planar_pair; .*{words}"):
+        identify(scene, [noisy(changed(log, **changes))])
+
+
+def test_numbers_that_are_far_off_are_no_mirror(scene, log):
+    """Neither a stiffness that is three times another, nor fast swings, nor outliers and gaps."""
+    p = noisy(log).p.copy()
+    p[::40] += 0.03
+    p[50:60] = np.nan
+    for one in (log, noisy(log), replace(log, p=p)):
+        for factor in (1 / 3, 1.0, 3.0):
+            rods = tuple(replace(rod, bending_stiffness=factor * rod.bending_stiffness) for rod in scene.robot.rods)
+            predictor = Predictor(scene, [one])
+            off = imbalance(predictor, predictor.plant(0, replace(scene.robot, rods=rods)), one)
+            assert off < 0.25, (factor, off)
+    unseen = replace(log, q=log.q * (np.nan, 1.0))
+    assert imbalance(predictor, predictor.plant(0, scene.robot), unseen) is None
 
 
 def test_encoders_that_wrap(scene, log):
@@ -341,3 +367,16 @@ def test_multiple_shooting_comes_to_the_same(scene, log, monkeypatch):
     for one, other in zip(whole.estimates, pieces.estimates, strict=True):
         assert one.value == pytest.approx(other.value, abs=0.1 * one.sd)
         assert one.sd == pytest.approx(other.sd, rel=0.1)
+
+
+@pytest.mark.slow
+def test_the_page_from_python(monkeypatch):
+    page = (ROOT / "docs" / "identification.md").read_text(encoding="utf-8")
+    [code] = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(ROOT)
+    names: dict = {}
+    exec(code, names)
+    stiffness = names["found"].estimate("rods[0].bending_stiffness")
+    assert stiffness.value == pytest.approx(truth_of("ours_1.csv")["rods[0].bending_stiffness"], abs=4 * stiffness.sd)
+    assert names["mine"].tip_mass == 0.295
+    assert "tip_mass" not in names["known"].names

@@ -157,6 +157,12 @@ def excite(
         [s].
     trials : int
         Candidates: three tenths drawn at random, the rest varied from the best.
+    seed : int
+        Of the candidates.
+    uncertainty : Uncertainty, optional
+        How well the robot's numbers are known; None: default priors.
+    progress : bool
+        Show each candidate on stderr.
 
     Raises
     ------

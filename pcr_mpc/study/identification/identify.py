@@ -13,6 +13,7 @@ from tqdm import tqdm
 from ...errors import IdentificationError
 from ...loop.scene import Scene
 from ...plant.uncertainty import Uncertainty
+from .balance import require_balance
 from .information import Information, information
 from .log import Log
 from .log_checks import LONGEST_DELAY, checked_log, delay_in_angles
@@ -93,6 +94,7 @@ def identify(
     if parameters.index("delay") is None and "delay" not in (fixed or {}):
         parameters = replace(parameters, held=parameters.held | {"delay": float(scene.delay)})
     predictor = Predictor(scene, logs)
+    require_balance(predictor, parameters.robot)
     with tqdm(desc="identify", unit="step", disable=not progress) as bar:
 
         def tell(half: float) -> None:

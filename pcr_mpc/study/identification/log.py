@@ -70,6 +70,13 @@ def read_log(path: str | Path, n: int) -> list[Log]:
     path : str or Path
         A CSV file with the columns ``t_s``, ``p_x_m``, ``p_y_m``, ``q0_rad``, ... and ``u0_rad_s``, ..., in any order
         and among others; the record of `track`, run.csv or run.npz, or its folder.
+    n : int
+        Motors of the robot.
+
+    Returns
+    -------
+    list of Log
+        In their order in time.
 
     Raises
     ------

@@ -67,7 +67,7 @@ def checked_log(log: Log, robot: Robot, pose: Equilibrium) -> Log:
     _check_tip(log, robot, pose.p)
     if not np.isnan(log.q).all():
         _check_angles(log, robot)
-        log = _unwrapped(log, robot, pose.q)
+        log = unwrapped(log, robot, pose.q)
         if log.driven_by == "commands":
             _check_rates(log)
     if np.nanmax(np.abs(log.u)) * log.step < 1e-7 and np.nanmax(np.nanstd(log.p, axis=0)) < 1e-6:
@@ -145,7 +145,8 @@ def _check_angles(log: Log, robot: Robot) -> None:
         )
 
 
-def _unwrapped(log: Log, robot: Robot, q_start: np.ndarray) -> Log:
+def unwrapped(log: Log, robot: Robot, q_start: np.ndarray) -> Log:
+    """Return a log whose angles do not jump by turns, and begin within half a turn of the scene's."""
     q = log.q.copy()
     for i in range(robot.n_rods):
         known = ~np.isnan(q[:, i])

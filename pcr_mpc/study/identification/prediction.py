@@ -15,6 +15,7 @@ from ...plant.motion.plant import Plant
 from ...plant.motion.rollout import rollout
 from ...plant.motion.sensitivities import sensitivities
 from ...plant.motion.step_limit import longest_step
+from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.held_tip import default_method
 from .commands import commands, filled
@@ -185,6 +186,10 @@ class Predictor:
             u = u.copy()
             u[tuple(self._unknown[log].T)] += missing
         return u
+
+    def plant(self, log: int, robot: Robot) -> Plant:
+        """Plant with which a log is predicted, of a robot."""
+        return self._plant(log, False).of(robot)
 
     def _plant(self, log: int, fine: bool) -> Plant:
         key = (log, fine)
