@@ -28,6 +28,8 @@ def digest(scene: Scene) -> str:
     facts = {name: _facts(getattr(scene, name)) for name in kept}
     if scene.untold_delay:
         facts["untold_delay"] = _facts(scene.untold_delay)
+    if scene.motors is not None:
+        facts["motors"] = _facts(scene.motors)
     facts["trajectory"] = own_motion(scene) or _facts(scene.trajectory)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
 

@@ -20,6 +20,7 @@ from ..linearisation.pose_limits import PoseLimits
 from ..plant.robot import Robot
 from ..plant.rod import Rod
 from ..plant.statics.equilibrium import Equilibrium
+from .hardware.motors import Motors
 from .references.reading import KINDS, built_in
 from .scene import Scene
 from .settings import Finding, Need, Payload, PlantSettings
@@ -30,7 +31,7 @@ ARRAYS = {
     "x": "states at t: tip position (2) [m], tip velocity (2) [m/s], motor angles (n) [rad]",
     "reference": "wanted tip positions at t [m]",
     "applied": "motor rates that each of the K plant steps got, after the scene's delays and lateness [rad/s]; "
-    "a motor at its stop does not follow them",
+    "where the scene has [motors], those at which these turn the clamps; a motor at its stop does not follow them",
     "u": "motor rates as decided in each of the M control periods; the motors get them the scene's delay later "
     "(see applied) [rad/s]",
     "measured": "states as the sensors gave them to the controller in each control period, noise and all, as x",
@@ -74,8 +75,8 @@ class Recorded:
 
 
 _KINDS: tuple[type, ...] = (
-    Scene, Robot, Rod, PlantSettings, Payload, Need, Finding, PoseLimits, Tuning, Model, ObserverTuning, *KINDS,
-    Recorded, Equilibrium,
+    Scene, Robot, Rod, PlantSettings, Payload, Need, Finding, PoseLimits, Motors, Tuning, Model, ObserverTuning,
+    *KINDS, Recorded, Equilibrium,
 )  # fmt: skip
 _BY_NAME = {kind.__name__: kind for kind in _KINDS}
 

@@ -18,6 +18,7 @@ from ..plant.robot import Robot, load_robot
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.free_tip import forward_statics, inverse_statics
 from ..toml_table import Table, read_toml
+from .hardware.motors import Motors, read_motors
 from .references.blended import duration_of
 from .references.reading import read_reference
 from .scene_checks import LATE, check_scene, is_multiple
@@ -87,6 +88,8 @@ class Scene:
         Encoders tell angles in (-pi, pi] only.
     tracking_error : float or None
         Distance of the tip from the reference beyond which a run counts as lost [m]. None: a tenth of the shortest rod.
+    motors : Motors or None
+        How the motors follow their commands, which no controller is told. None: at once.
     """
 
     name: str
@@ -114,6 +117,7 @@ class Scene:
     wrapped: bool = False
     tracking_error: float | None = None
     untold_delay: float = 0.0
+    motors: Motors | None = None
 
     @property
     def allowed_error(self) -> float:
@@ -287,11 +291,12 @@ def load_scene(path: str | Path) -> Scene:
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
             wrapped = sensor.boolean("wrapped", False)
         payload = read_payload(file)
-        need, finding = read_need(file), read_finding(file)
+        need, finding, moved_by = read_need(file), read_finding(file), read_motors(file)
         scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                       tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
                       delay, deadline, late, pose_limits, payload, need, finding,
-                      wrapped=wrapped, tracking_error=tracking_error, untold_delay=untold_delay)  # fmt: skip
+                      wrapped=wrapped, tracking_error=tracking_error, untold_delay=untold_delay,
+                      motors=moved_by)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

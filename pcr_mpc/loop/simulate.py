@@ -21,6 +21,7 @@ from .controllers import Controller, decision_of, name_of
 from .feasibility import demand_line, reference_demand, reference_excess
 from .feed_forward import InverseDynamics, feed_forward
 from .foreign_parts import check_parts
+from .hardware.drive import drive_of
 from .record import versions
 from .run import Run
 from .scene import Scene
@@ -89,6 +90,7 @@ def simulate(
     on_the_way = deque([(still, 0, still)] * scene.delay)
     later = UntoldDelay(scene.untold_delay, plant.dt, n)
 
+    drive = drive_of(scene, plant.dt, pose)
     states = np.empty((n_periods * per + 1, len(x)))
     inputs = np.empty((n_periods, n))
     plant_time = np.empty(n_periods * per)
@@ -151,6 +153,8 @@ def simulate(
         for k in tqdm(range(n_periods), desc=scene.name, unit="period", disable=not progress):
             interrupt.check()
             measured = x.copy()
+            if drive is not None:
+                measured[4:] = drive.angles(x)
             if scene.tip_noise:
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
             if scene.angle_step:
@@ -202,6 +206,9 @@ def simulate(
                 u = later(meanwhile if j < waiting else arrived)
                 if done in changes:
                     x = plant.carry(float(payloads[done]), x)
+                if drive is not None:
+                    u = drive.turn(x, u)
+                    events += drive.news(done * plant.dt)
                 applied[done] = u
                 began = time.perf_counter()
                 x = plant.step(x, u, scene.force)
