@@ -18,7 +18,7 @@ from pcr_mpc import Equilibrium, InfeasibleError, Plant, Robot, Scene, Tuning, l
 from pcr_mpc.control.mpc import terminal_weight
 from pcr_mpc.loop.controllers import Decision
 from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.tracking import motor_limits
+from pcr_mpc.loop.parts import motor_limits
 
 _MOST_ITERATIONS = 20
 # Of the expected decrease of the cost, in the cost's own unit: a tip that is 1 cm off for one period costs 0.5.

@@ -13,7 +13,7 @@ from pcr_mpc import Equilibrium, InfeasibleError, Plant, Robot, Scene, Tuning, l
 from pcr_mpc.control.mpc import terminal_weight
 from pcr_mpc.loop.controllers import Decision
 from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.tracking import motor_limits
+from pcr_mpc.loop.parts import motor_limits
 from pcr_mpc.plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 
 with warnings.catch_warnings():

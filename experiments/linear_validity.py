@@ -47,7 +47,7 @@ from pcr_mpc import (
 )
 from pcr_mpc.loop.controllers import Controller, Decision
 from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.tracking import motor_limits
+from pcr_mpc.loop.parts import motor_limits
 from pcr_mpc.loop.trajectory import Lemniscate
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREY, RED, plt

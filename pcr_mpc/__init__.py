@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .linearisation.linearise import linearise
     from .loop.controllers import Controller, Decision, HoldMotors
     from .loop.feasibility import check_scene
+    from .loop.make_controller import make_controller
     from .loop.references.blended import Blended
     from .loop.references.on_curves import Circle, Line, Polygon, Spline, Waypoints
     from .loop.references.path_file import load_path
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from .loop.scene import Scene, load_scene
     from .loop.sensors import Sensors
     from .loop.simulate import simulate
-    from .loop.tracking import TrackingController, make_controller
+    from .loop.tracking import TrackingController
     from .loop.trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
     from .plant.materials import MATERIALS, Material, Section
     from .plant.motion.plant import Plant
@@ -189,7 +190,8 @@ _WHERE = {
     "loop.scene": ("Scene", "load_scene"),
     "loop.sensors": ("Sensors",),
     "loop.simulate": ("simulate",),
-    "loop.tracking": ("TrackingController", "make_controller"),
+    "loop.tracking": ("TrackingController",),
+    "loop.make_controller": ("make_controller",),
     "loop.trajectory": ("Hold", "Lemniscate", "PickAndPlace", "Trajectory"),
     "plant.motion.plant": ("Plant",),
     "plant.statics.equilibria": ("Equilibria",),

@@ -16,13 +16,13 @@ from .control.tuning import Tuning, load_tuning
 from .errors import OutputError, PCRError, SimulationError
 from .files import require_folder, results, saved
 from .loop.controllers import Controller
+from .loop.make_controller import make_controller
 from .loop.model_inertia import by_model_inertia
 from .loop.own_controller import OwnController
 from .loop.run import RECORD, Run
 from .loop.scene import load_scene
 from .loop.simulate import simulate
 from .loop.simulated_plant import SimulatedPlant
-from .loop.tracking import make_controller
 from .plant.mujoco.plant import MuJoCoPlant
 from .report.plots import animate_run, plot_run
 from .report.tables import summary_table

@@ -105,7 +105,7 @@ def test_it_tracks_as_a_simulation_does(live, centre, scene):
     known = make_controller(replace(scene, duration=1.1))
     known.start(centre)
     window = known.reference.states[:, 4:]
-    assert np.allclose(live._track.window(109, 0)[0, 4:6], window[110], atol=1e-8)
+    assert np.allclose(live._work.track.window(109, 0)[0, 4:6], window[110], atol=1e-8)
 
 
 def test_a_load_at_the_start_is_no_surprise(live, centre):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import InfeasibleError, Plant, load_scene
-from pcr_mpc.loop.tracking import TrackingController, motor_limits
+from pcr_mpc.loop.parts import motor_limits
+from pcr_mpc.loop.tracking import TrackingController
 
 from .conftest import MODELS
 

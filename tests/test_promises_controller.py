@@ -18,9 +18,10 @@ from pcr_mpc import (
 )
 from pcr_mpc.loop.controllers import HoldMotors
 from pcr_mpc.loop.feed_forward import _momentum, feed_forward
+from pcr_mpc.loop.parts import motor_limits
 from pcr_mpc.loop.settings import Payload
 from pcr_mpc.loop.target import MotorTarget
-from pcr_mpc.loop.tracking import TrackingController, motor_limits
+from pcr_mpc.loop.tracking import TrackingController
 from pcr_mpc.loop.trajectory import PickAndPlace
 
 from .conftest import CONTROLLERS, MODELS

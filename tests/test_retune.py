@@ -13,7 +13,7 @@ from pcr_mpc.control.observer import ObserverTuning
 from pcr_mpc.control.tuning import Limits
 from pcr_mpc.errors import PCRError, ReadOnlyError
 from pcr_mpc.loop.foresight import Foresight
-from pcr_mpc.loop.tracking import motor_limits
+from pcr_mpc.loop.parts import motor_limits
 
 from .conftest import CONTROLLERS, MODELS
 
@@ -209,10 +209,11 @@ def test_a_retuned_controller_decides_as_one_that_was_tuned_so_from_the_start(sc
     new, _ = begun(scene, tuning, 4)
     # The same knowledge: of the state, of the force, of the rates before and on the way.
     new.observer.x, new.observer.force = controller.observer.x.copy(), controller.observer.force.copy()
-    new._u, new._sent = controller._u, copy.copy(controller._sent)
-    new._on_the_way.clear()
-    new._on_the_way.extend(list(controller._sent)[len(controller._sent) - new._delay :])
-    new._foresight.target_from(controller._foresight)
+    old, work = controller._work, new._work
+    work.u, work.sent = old.u, copy.copy(old.sent)
+    work.on_the_way.clear()
+    work.on_the_way.extend(list(old.sent)[len(old.sent) - work.delay :])
+    work.foresight.target_from(old.foresight)
     controller.retune(tuning)
     assert controller.name == tuning.name
     assert controller.tuning is tuning

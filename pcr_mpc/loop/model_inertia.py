@@ -8,10 +8,10 @@ from typing import Any
 from .. import interrupt
 from ..control.tuning import Tuning
 from ..errors import SimulationError
+from .make_controller import make_controller
 from .run import Run
 from .simulate import simulate
 from .simulated_plant import SimulatedPlant
-from .tracking import make_controller
 
 INERTIAS = ("none", "condensed")
 _FIGURES = ("rms_mm", "rms_after_1s_mm", "max_mm", "failures")

@@ -13,6 +13,7 @@ from ..control.observer import DisturbanceObserver
 from ..control.qp import motor_bounds, stage_weights
 from ..control.tuning import Limits, Model, Tuning
 from ..linearisation.linear_model import LinearModel
+from ..linearisation.linearise import linearise
 from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
@@ -35,6 +36,18 @@ def make_model(robot: Robot, model: Model) -> Plant:
         robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
         inertia=model.inertia,
     )  # fmt: skip
+
+
+def resting_state(pose: Equilibrium) -> np.ndarray:
+    """State of a robot that rests in ``pose``, shape (4 + n,)."""
+    return np.concatenate([pose.p, np.zeros(2), pose.q])
+
+
+def resting_model(robot: Robot, model: Model, pose: Equilibrium, period: float) -> LinearModel:
+    """Linear model about a pose in which the robot rests."""
+    plant, x = make_model(robot, model), resting_state(pose)
+    plant.reset(x, pose)
+    return linearise(plant, x, np.zeros(robot.n_rods), period)
 
 
 def make_gate(scene: Scene, tuning: Tuning, robot: Robot, limits: Limits) -> Gate:

@@ -38,6 +38,10 @@ class MotorTarget(Remade):
         self._plant.reset(np.concatenate([pose.p, [0.0, 0.0], pose.q]), pose)
         self._shift = np.zeros(len(pose.q))
 
+    def angles(self, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """Angles q, moved so that F = force at p (see `shift`)."""
+        return np.asarray(q + self.shift(p, q, force))
+
     def shift(self, p: np.ndarray, q: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Angles to add to q so that F = force at p; the last ones where the rods cannot follow."""
         try:

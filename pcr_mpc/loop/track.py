@@ -6,7 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .feed_forward import InverseDynamics
+from ..plant.robot import Robot
+from ..plant.statics.equilibrium import Equilibrium
+from .feed_forward import InverseDynamics, held
+from .scene import Scene
 
 
 class Track:
@@ -50,6 +53,19 @@ class Track:
         """That the tip carries from period k on."""
         first = min(k, len(self._payloads) - count)
         return self._payloads[first : first + count]
+
+
+def track_of(
+    scene: Scene, robot: Robot, pose: Equilibrium, reference: InverseDynamics, horizon: int, tail: int
+) -> Track:
+    """Windows of a scene's reference, which was solved ``tail`` periods beyond the end, from ``pose`` on."""
+    # Longer than any place is ahead of the end.
+    payloads = scene.carried(scene.period * np.arange(scene.n_periods + 2 * tail))
+
+    def hold() -> InverseDynamics:
+        return held(reference, scene.n_periods, robot, pose, float(payloads[-1]), 1)
+
+    return Track(reference, payloads, scene.n_periods, horizon, hold)
 
 
 def _rows(reference: InverseDynamics) -> np.ndarray:

@@ -12,11 +12,11 @@ from tqdm import tqdm
 from .. import interrupt
 from ..errors import NoRungError, PCRError, SimulationError
 from ..loop.controllers import Replay
+from ..loop.make_controller import make_controller
 from ..loop.run import Run
 from ..loop.scene import Scene
 from ..loop.settings import Need, PlantSettings
 from ..loop.simulate import simulate
-from ..loop.tracking import make_controller
 from .estimates import Estimate, Estimates
 from .rungs import all_physics, discretisations, height, named
 

@@ -19,12 +19,12 @@ from ..control.tuning import Tuning
 from ..errors import SimulationError, checked_integer, checked_number
 from ..loop.controllers import Controller
 from ..loop.feed_forward import InverseDynamics, feed_forward
+from ..loop.make_controller import make_controller
 from ..loop.own_controller import built
 from ..loop.references.reading import built_in
 from ..loop.run import Run
 from ..loop.scene import Scene
 from ..loop.simulate import simulate
-from ..loop.tracking import make_controller
 from ..loop.trajectory import Trajectory, sampled
 
 Row = dict[str, Any]
