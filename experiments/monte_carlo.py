@@ -7,6 +7,7 @@ kept in episodes.jsonl: the same command, given again, goes on where the last on
 
     python experiments/monte_carlo.py --episodes 500
     python experiments/monte_carlo.py --episodes 20000 --dask tcp://scheduler:8786
+    python experiments/monte_carlo.py --robot mine.toml       numbers as `pcr-mpc identify` knows them
     python experiments/monte_carlo.py --replay 17
 """
 
@@ -28,14 +29,25 @@ import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import binomtest, spearmanr
 
-from pcr_mpc import PCRError, Scene, SimulationError, Tuning, load_scene, load_tuning
+from pcr_mpc import (
+    ModelError,
+    PCRError,
+    Scene,
+    SimulationError,
+    Spread,
+    Tuning,
+    load_robot,
+    load_scene,
+    load_tuning,
+    load_uncertainty,
+)
 from pcr_mpc.cli_parser import tuning_or_class
 from pcr_mpc.loop.own_controller import OwnController
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.plots import animate_run, plot_run
 from pcr_mpc.report.style import BLUE, GREY, ORANGE, RED, plt
 from pcr_mpc.report.tables import summary_table, table
-from pcr_mpc.study.episodes import ALLOWED_ERROR, SETTLING, Spread, lighter, run_episode, simulate_episode
+from pcr_mpc.study.episodes import ALLOWED_ERROR, SETTLING, lighter, run_episode, simulate_episode
 from pcr_mpc.study.parallel import collect, local_workers
 from pcr_mpc.study.provenance import described, source_digest
 
@@ -46,7 +58,10 @@ DEFAULT_SCENE = MODELS / "scenes" / "lemniscate.toml"
 
 
 # Kinds of mismatch, as they are drawn from top to bottom.
-KINDS = ("delay", "load", "bending stiffness", "tip mass", "drag", "bases", "tip noise", "encoder step")
+KINDS = (
+    "delay", "load", "bending stiffness", "tip mass", "drag", "bases", "lengths", "line density", "tip noise",
+    "encoder step",
+)  # fmt: skip
 
 
 def sizes(row: Row) -> dict[str, float]:
@@ -60,6 +75,8 @@ def sizes(row: Row) -> dict[str, float]:
         "tip mass": off("mass", 1.0),
         "drag": abs(math.log(row["drag"])),
         "bases": off("base", 0.0),
+        "lengths": off("length", 1.0),
+        "line density": off("line_density", 1.0),
         "delay": off("delay", 0.0),
         "tip noise": off("tip_noise", 0.0),
         "encoder step": off("angle_step", 0.0),
@@ -209,17 +226,17 @@ def workers(jobs: int | None, dask: str | None) -> Iterator[Executor]:
         yield client.get_executor()
 
 
-def replay(scene: Scene, tuning: Tuning | OwnController, seed: int, folder: Path) -> str:
+def replay(scene: Scene, tuning: Tuning | OwnController, seed: int, spread: Spread, folder: Path) -> str:
     """Run one episode once more; write its record and pictures; return its table."""
     try:
-        run = simulate_episode(scene, tuning, seed, progress=True)
+        run = simulate_episode(scene, tuning, seed, spread, progress=True)
     except SimulationError as error:
         print(error, file=sys.stderr)
         run = error.run
     run.save(folder)
     plot_run(run, folder / "track.png")
     animate_run(run, folder / "track.gif", progress=True)
-    off = ", ".join(f"{name} {value:.4g}" for name, value in Spread().sample(scene.robot.n_rods, seed).row().items())
+    off = ", ".join(f"{name} {value:.4g}" for name, value in spread.sample(scene.robot.n_rods, seed).row().items())
     return f"seed {seed}: {off}\n\n{summary_table(run.summary())}"
 
 
@@ -239,6 +256,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, help="folder for the results (default results/monte_carlo/SCENE_CONTROLLER)"
     )
+    parser.add_argument(
+        "--robot", type=Path, metavar="FILE",
+        help="robot that the controller believes in, as `pcr-mpc identify --out` writes it: how far off its numbers "
+        "are is drawn from its [uncertainty], not from assumed ranges",
+    )  # fmt: skip
     parser.add_argument("--replay", type=int, metavar="SEED", help="run this one episode in full, with pictures")
     parser.add_argument("--fresh", action="store_true", help="discard the finished episodes in that folder first")
     parser.add_argument("--quick", action="store_true", help="8 episodes of 1.2 s")
@@ -253,8 +275,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
+def as_known(scene: Scene, path: Path) -> tuple[Scene, Spread]:
+    """Scene whose robot is believed to have the numbers in a file, and how far off they may be by its [uncertainty].
+
+    Raises
+    ------
+    ModelError
+        The file does not say, or is of another kind of robot.
+    """
+    robot, known = load_robot(path), load_uncertainty(path)
+    if known is None:
+        raise ModelError(f"{path}: has no [uncertainty]; pcr-mpc identify --out writes robots that have one")
+    if robot.n_rods != scene.robot.n_rods:
+        raise ModelError(
+            f"{path}: {robot.name} has {robot.n_rods} rods, that of scene {scene.name} {scene.robot.n_rods}"
+        )
+    # Limits and gravity may be the scene's own.
+    believed = replace(scene.robot, name=robot.name, rods=robot.rods, tip_mass=robot.tip_mass, drag=robot.drag)
+    return replace(scene, robot=believed), Spread(known=known, believed=believed)
+
+
 def _study(options: argparse.Namespace) -> int:
-    scene = load_scene(options.scene)
+    scene, spread = load_scene(options.scene), Spread()
+    if options.robot:
+        scene, spread = as_known(scene, options.robot)
     tuning: Tuning | OwnController | None = scene.tuning
     if options.controller:
         own = isinstance(options.controller, str)
@@ -270,15 +314,16 @@ def _study(options: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     if options.replay is not None:
         folder = folder / f"seed_{options.replay}"
-        print(f"\n{replay(scene, tuning, options.replay, folder)}\n\nwritten to {folder}")
+        print(f"\n{replay(scene, tuning, options.replay, spread, folder)}\n\nwritten to {folder}")
         return 0
     journal = folder / "episodes.jsonl"
     if options.fresh:
         journal.unlink(missing_ok=True)
     seeds = range(options.seed, options.seed + episodes)
-    settings = {**described(scene, tuning, Spread()), "code": source_digest()}
+    settings = {**described(scene, tuning, spread), "code": source_digest()}
     with workers(options.jobs, options.dask) as executor:
-        rows = collect(executor, partial(run_episode, scene, tuning), seeds, journal, settings, desc=scene.name)
+        task = partial(run_episode, scene, tuning, **({"spread": spread} if options.robot else {}))
+        rows = collect(executor, task, seeds, journal, settings, desc=scene.name)
     summary = summarise(rows)
     timing = [row["timing"] for row in rows if row["timing"]["control_cpu_us"] is not None]
     measured = {name: quantiles(timing, name) for name in ("control_cpu_us", "episode_s")}
@@ -294,6 +339,7 @@ def _again(options: argparse.Namespace) -> str:
     """The command that replays an episode of this study, but for the seed."""
     parts = ["python experiments/monte_carlo.py"]
     parts += [f"--scene {options.scene}"] if options.scene != DEFAULT_SCENE else []
+    parts += [f"--robot {options.robot}"] if options.robot else []
     parts += [f"--controller {options.controller}"] if options.controller else []
     parts += ["--quick"] if options.quick else [f"--duration {options.duration:g}"]
     parts += [f"--out {options.out}"] if options.out else []

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from .plant.uncertainty import Uncertainty, load_uncertainty
     from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
     from .report.tables import equilibria_table, equilibrium_table, summary_table
-    from .study.episodes import Spread, run_episode, simulate_episode
+    from .study.episodes import run_episode, simulate_episode
     from .study.excitation import Excitation, excite
     from .study.identification.identify import identify
     from .study.identification.log import Log, read_log
@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from .study.planning.limits import PlanLimits
     from .study.planning.plan import plan_timing
     from .study.planning.timed_path import TimedPath
+    from .study.spread import Spread
 
 __all__ = [
     "MATERIALS",
@@ -208,7 +209,7 @@ _WHERE = {
     "report.plots": ("animate_run", "plot_equilibria", "plot_equilibrium", "plot_run"),
     "report.tables": ("equilibria_table", "equilibrium_table", "summary_table"),
     "plant.uncertainty": ("Uncertainty", "load_uncertainty"),
-    "study.episodes": ("Spread", "run_episode", "simulate_episode"),
+    "study.episodes": ("run_episode", "simulate_episode"),
     "study.excitation": ("Excitation", "excite"),
     "study.identification.identify": ("identify",),
     "study.identification.log": ("Log", "read_log"),
@@ -216,6 +217,7 @@ _WHERE = {
     "study.planning.limits": ("PlanLimits",),
     "study.planning.plan": ("plan_timing",),
     "study.planning.timed_path": ("TimedPath",),
+    "study.spread": ("Spread",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 

@@ -20,9 +20,10 @@ from .report.timing import plot_timing, timing_tables
 from .report.trade_off import plot_trade_off
 from .study.choice import choose
 from .study.chosen_rung import require_plant_table, write_rung
-from .study.episodes import Spread, lighter
+from .study.episodes import lighter
 from .study.parallel import local_workers
 from .study.provenance import commit
+from .study.spread import Spread
 from .study.timing import time_scene
 from .study.tuning_file import default_path, to_tune, write_tuning
 from .study.tuning_space import Search

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import load_scene, make_controller, simulate
+from pcr_mpc import ModelError, Uncertainty, load_scene, make_controller, simulate
 from pcr_mpc.loop.controllers import HoldMotors
 from pcr_mpc.loop.feed_forward import feed_forward
 from pcr_mpc.loop.trajectory import Hold
@@ -60,6 +60,67 @@ def test_samples_fill_their_ranges_and_nothing_else():
     # Independent of each other, to five standard errors.
     drawn = np.column_stack([values.reshape(len(samples), -1) for values, _, _ in columns.values()])
     assert np.abs(np.corrcoef(drawn.T) - np.eye(drawn.shape[1])).max() < 5 / math.sqrt(len(samples))
+
+
+NAMES = ("rods[0].bending_stiffness", "rods[1].bending_stiffness", "tip_mass", "rods[1].base_y", "rods[0].length")
+
+
+@pytest.fixture(scope="module")
+def known(scene):
+    """Both stiffnesses and the mass nearly share one scale; the fourth and fifth go together the other way."""
+    matrix = np.eye(5)
+    matrix[:3, :3] = 0.98 + 0.02 * np.eye(3)
+    matrix[3, 4] = matrix[4, 3] = -0.6
+    return Uncertainty(NAMES, np.array([0.0025, 0.0025, 0.0125, 3e-4, 1e-3]), matrix)
+
+
+def test_what_is_known_is_drawn_with_all_its_correlations(scene, known):
+    spread = Spread(known=known, believed=scene.robot)
+    assumed = Spread()
+    samples = [spread.sample(2, seed) for seed in range(3000)]
+    robots = [one.applied_to(scene).robot for one in samples]
+    rods = [robot.rods for robot in robots]
+    drawn = np.array(
+        [[np.log(a.bending_stiffness), np.log(b.bending_stiffness), np.log(robot.tip_mass), b.base[1], np.log(a.length)]
+         for (a, b), robot in zip(rods, robots, strict=True)]
+    )  # fmt: skip
+    believed = scene.robot
+    values = np.array([believed.rods[0].bending_stiffness, believed.rods[1].bending_stiffness, believed.tip_mass, 1.0,
+                       believed.rods[0].length])  # fmt: skip
+    wanted = known.sd / values
+    assert drawn.std(axis=0) == pytest.approx(wanted, rel=5 / math.sqrt(2 * len(samples)))
+    middle = np.log(values[[0, 1, 2, 4]])
+    assert np.abs(drawn.mean(axis=0)[[0, 1, 2, 4]] - middle).max() < 5 * wanted.max() / math.sqrt(len(samples))
+    found = np.corrcoef(drawn.T)
+    slack = 5 * (1 - known.correlation**2) / math.sqrt(len(samples))
+    assert (np.abs(found - known.correlation) <= slack + 1e-12).all()
+    for one, seed in zip(samples[:50], range(50), strict=False):
+        other = assumed.sample(2, seed)
+        assert (one.drag, one.delay, one.tip_noise, one.force) == (
+            other.drag,
+            other.delay,
+            other.tip_noise,
+            other.force,
+        )
+        assert one.base_offset[0] == other.base_offset[0]
+        assert one.base_offset[1][0] == other.base_offset[1][0]
+        assert one.length[1] == 1.0
+    assert json.loads(json.dumps(samples[0].row()))["length0"] == samples[0].length[0]
+    assert "length0" not in assumed.sample(2, 0).row()
+
+
+def test_what_cannot_be_known_is_named(scene, known):
+    with pytest.raises(ValueError, match="known and believed go together"):
+        Spread(known=known)
+    for name, words in (("rods[2].length", "which planar_pair with 2 rods has not"), ("delay", "tip_mass, drag")):
+        other = replace(known, names=(*NAMES[:4], name))
+        with pytest.raises(ModelError, match=words):
+            Spread(known=other, believed=scene.robot)
+    still = replace(scene.robot, drag=0.0)
+    with pytest.raises(ModelError, match="'drag', which planar_pair has at 0"):
+        Spread(known=replace(known, names=(*NAMES[:4], "drag")), believed=still)
+    with pytest.raises(ValueError, match="2 rods, the scene's has 3"):
+        Spread(known=known, believed=scene.robot).sample(3, 0)
 
 
 @pytest.mark.parametrize("wrong", [{"stiffness": -0.1}, {"mass": 1.0}, {"drag": 0.5}, {"force": math.nan}])

@@ -10,6 +10,7 @@ from experiments import monte_carlo
 from experiments.monte_carlo import correlations, main, sizes, summarise, worst
 from pcr_mpc.study.episodes import EXACT, Spread
 
+from .conftest import MODELS
 from .test_parallel import Here
 
 BRIEF = ["--duration", "0.1", "--episodes", "2", "--seed", "7"]
@@ -75,6 +76,23 @@ def test_a_second_call_resumes_unless_told_otherwise(here, tmp_path, monkeypatch
     capsys.readouterr()
     assert main(["--out", str(tmp_path), "--duration", "0.12", "--episodes", "1"]) == 1
     assert "rows of other settings: scene.duration was 0.1, is 0.12" in capsys.readouterr().err
+
+
+def test_a_robot_as_identified_is_sampled_from_its_uncertainty(here, tmp_path, capsys):
+    text = (MODELS / "planar_pair.toml").read_text(encoding="utf-8")
+    out = ["--out", str(tmp_path / "out"), "--duration", "0.1", "--episodes", "1", "--robot"]
+    assert main([*out, str(MODELS / "planar_pair.toml")]) == 1
+    assert "has no [uncertainty]" in capsys.readouterr().err
+    path = tmp_path / "mine.toml"
+    path.write_text(text + '\n[uncertainty]\nnames = ["tip_mass", "rods[0].length"]\nsd = [1e-7, 1e-4]\n')
+    assert main([*out, str(path)]) == 0
+    assert f"--robot {path}" in capsys.readouterr().out
+    head, line = (tmp_path / "out" / "episodes.jsonl").read_text().splitlines()
+    assert '"known"' in head
+    row, assumed = json.loads(line), Spread().sample(2, 0)
+    assert row["mass"] == pytest.approx(1.0, abs=5e-6)
+    assert row["length0"] != 1.0
+    assert (row["stiffness0"], row["length1"]) == (assumed.stiffness[0], 1.0)
 
 
 def test_the_interval_is_that_of_clopper_and_pearson():

@@ -16,7 +16,7 @@ import numpy as np
 
 from .. import interrupt
 from ..control.tuning import Tuning
-from ..errors import SimulationError, checked_integer, checked_number
+from ..errors import SimulationError, checked_integer
 from ..loop.controllers import Controller
 from ..loop.feed_forward import InverseDynamics, feed_forward
 from ..loop.make_controller import make_controller
@@ -26,6 +26,9 @@ from ..loop.run import Run
 from ..loop.scene import Scene
 from ..loop.simulate import simulate
 from ..loop.trajectory import Trajectory, sampled
+from .spread import ASSUMED, EXACT, Mismatch, Spread
+
+__all__ = ["ASSUMED", "EXACT", "Mismatch", "Spread", "lighter", "run_episode", "simulate_episode"]
 
 Row = dict[str, Any]
 Maker = Callable[..., Controller]
@@ -38,141 +41,6 @@ SETTLING = 1.0
 _ONE_AT_A_TIME = threading.Lock()
 
 
-@dataclass(frozen=True)
-class Mismatch:
-    """What is off in one episode.
-
-    Attributes
-    ----------
-    stiffness : tuple of float, one a rod
-        True bending stiffness EI over the believed one.
-    mass, drag : float
-        True tip mass and drag over the believed ones.
-    base_offset : tuple of (float, float), one a rod
-        Where the motor really is, less where it is believed to be [m].
-    delay : int
-        Control periods of the scene by which commands come later than the controller knows.
-    tip_noise : float
-        Standard deviation of the measured tip position, beside the scene's own [m].
-    angle_step : float
-        Resolution of the encoders, if coarser than the scene's [rad]. It stands on the data sheet: the controller
-        knows it, as it knows the scene's.
-    force : (float, float)
-        External force on the tip, beside the scene's own [N].
-    """
-
-    stiffness: tuple[float, ...]
-    mass: float
-    drag: float
-    base_offset: tuple[tuple[float, float], ...]
-    delay: int
-    tip_noise: float
-    angle_step: float
-    force: tuple[float, float]
-
-    def applied_to(self, scene: Scene) -> Scene:
-        """Return the scene as it really is."""
-        rods = tuple(
-            replace(
-                rod,
-                bending_stiffness=factor * rod.bending_stiffness,
-                base=(rod.base[0] + offset[0], rod.base[1] + offset[1]),
-            )
-            for rod, factor, offset in zip(scene.robot.rods, self.stiffness, self.base_offset, strict=True)
-        )
-        robot = replace(
-            scene.robot, rods=rods, tip_mass=self.mass * scene.robot.tip_mass, drag=self.drag * scene.robot.drag
-        )
-        return replace(
-            scene,
-            robot=robot,
-            delay=scene.delay + self.delay,
-            tip_noise=math.hypot(scene.tip_noise, self.tip_noise),
-            angle_step=max(scene.angle_step, self.angle_step),
-            force=(scene.force[0] + self.force[0], scene.force[1] + self.force[1]),
-        )
-
-    def row(self) -> Row:
-        """Plain columns, with units in their names."""
-        return {
-            **{f"stiffness{i}": factor for i, factor in enumerate(self.stiffness)},
-            "mass": self.mass,
-            "drag": self.drag,
-            **{f"base{i}_{axis}_m": offset[j] for i, offset in enumerate(self.base_offset)
-               for j, axis in enumerate("xy")},
-            "delay": self.delay,
-            "tip_noise_m": self.tip_noise,
-            "angle_step_rad": self.angle_step,
-            "force_x_N": self.force[0],
-            "force_y_N": self.force[1],
-        }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Spread:
-    """How far off things may be. Uniform within the ranges, independent of each other.
-
-    Attributes
-    ----------
-    stiffness : float
-        EI of each rod is off by up to this fraction. Strip of 0.71 mm comes to 0.01 mm, which is 4 % of EI (t^3), and
-        the modulus of carbon fibre differs by 5 % from one maker to another.
-    mass : float
-        Tip mass, by up to this fraction: a payload of 50 g on 250 g.
-    drag : float
-        Between 1/drag and drag times the believed value, uniform in its logarithm: of friction one knows the size only.
-    base_offset : float
-        Each coordinate of each motor, by up to this [m]: a bench drilled by hand.
-    delay : int
-        0 to this many control periods more than the controller was told: a bus or a camera that takes one longer.
-    tip_noise : float
-        Up to this standard deviation [m]; twice that of the good camera in the scene "sensors".
-    angle_step : float
-        Up to this resolution [rad]: encoders of 12 bits a turn and better.
-    force : float
-        Any direction, up to this [N]: 40 % of the weight of the tip mass, as in "hold_with_load".
-    """
-
-    stiffness: float = 0.1
-    mass: float = 0.2
-    drag: float = 2.0
-    base_offset: float = 1e-3
-    delay: int = 1
-    tip_noise: float = 1e-4
-    angle_step: float = 2 * math.pi / 4096
-    force: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("stiffness", "mass"):
-            checked_number(name, getattr(self, name), minimum=0.0, maximum=0.99)
-        for name in ("base_offset", "delay", "tip_noise", "angle_step", "force"):
-            checked_number(name, getattr(self, name), minimum=0.0)
-        checked_number("drag", self.drag, minimum=1.0)
-
-    def sample(self, n_rods: int, seed: int) -> Mismatch:
-        """Draw what is off in the episode of a seed; depends on nothing else."""
-        rng = np.random.default_rng(
-            [checked_integer("seed", seed, minimum=0), 1]
-        )  # not the stream of the measurement noise, default_rng(seed)
-        stiffness = 1.0 + self.stiffness * rng.uniform(-1.0, 1.0, n_rods)
-        offsets = self.base_offset * rng.uniform(-1.0, 1.0, (n_rods, 2))
-        direction, size = rng.uniform(0.0, 2 * math.pi), self.force * rng.uniform()
-        return Mismatch(
-            stiffness=tuple(stiffness.tolist()),
-            mass=1.0 + self.mass * rng.uniform(-1.0, 1.0),
-            drag=self.drag ** rng.uniform(-1.0, 1.0),
-            base_offset=tuple((x, y) for x, y in offsets.tolist()),
-            delay=int(rng.integers(0, self.delay, endpoint=True)),
-            tip_noise=self.tip_noise * rng.uniform(),
-            angle_step=self.angle_step * rng.uniform(),
-            force=(size * math.cos(direction), size * math.sin(direction)),
-        )
-
-
-# Everything is as the controller believes.
-EXACT = Spread(stiffness=0.0, mass=0.0, drag=1.0, base_offset=0.0, delay=0, tip_noise=0.0, angle_step=0.0, force=0.0)
-
-
 def lighter(scene: Scene) -> Scene:
     """Return the scene with velocity Verlet for RK4: a third of the cost, and an error that no mismatch notices."""
     if scene.plant.integrator != "rk4":
@@ -181,7 +49,7 @@ def lighter(scene: Scene) -> Scene:
 
 
 def simulate_episode(
-    scene: Scene, tuning: Tuning | Maker, seed: int, spread: Spread = Spread(), *, progress: bool = False
+    scene: Scene, tuning: Tuning | Maker, seed: int, spread: Spread = ASSUMED, *, progress: bool = False
 ) -> Run:
     """Run the episode of a seed: the sampled robot moves, the controller knows the scene's.
 
@@ -248,7 +116,7 @@ def _reference(believed: Scene, horizon: int, inertia: str) -> InverseDynamics:
     return feed_forward(believed, believed.robot, believed.start(), horizon, inertia)
 
 
-def run_episode(scene: Scene, tuning: Tuning | Maker, seed: int, spread: Spread = Spread()) -> Row:
+def run_episode(scene: Scene, tuning: Tuning | Maker, seed: int, spread: Spread = ASSUMED) -> Row:
     """Run the episode of a seed and judge it; a failing one is a row like the others.
 
     Parameters

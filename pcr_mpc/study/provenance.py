@@ -14,7 +14,8 @@ from ..loop.finding import own_motion
 from ..loop.own_controller import OwnController
 from ..loop.scene import Scene
 from ..plain import plain
-from .episodes import Maker, Spread
+from .episodes import Maker
+from .spread import Spread
 
 _PACKAGE = Path(__file__).parent.parent
 

@@ -9,7 +9,8 @@ from typing import Any
 
 from ..control.tuning import Tuning
 from ..loop.scene import Scene
-from .episodes import EXACT, Row, Spread, run_episode
+from .episodes import Row, run_episode
+from .spread import EXACT, Spread
 
 # What each cost counts for, as a ratio to that of the start, and below which value it is not worth lowering: a camera
 # does not see errors below 10 um; without mismatch the figure is the model's, and 2 um are wanted of it.

@@ -10,7 +10,7 @@ from ..control.tuning import LINEARISE, Tuning
 from ..errors import PCRError
 from ..loop.scene import Scene
 from ..loop.scene_checks import is_multiple
-from .episodes import Spread
+from .spread import Spread
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
