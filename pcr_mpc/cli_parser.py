@@ -24,6 +24,7 @@ examples:
   pcr-mpc choose vertical                               what physics the scene needs, and why
   pcr-mpc identify lemniscate run.csv --out mine.toml   a robot's numbers from recorded motion
   pcr-mpc excite lemniscate --duration 6                a motion worth recording
+  pcr-mpc generate lemniscate --out build/lemniscate       controller and plant as C
   pcr-mpc timing lemniscate                             step times against the real-time budgets
   pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
   pcr-mpc copy lemniscate mine                          a copy of that scene to change
@@ -194,6 +195,19 @@ def parser() -> argparse.ArgumentParser:
     excitation.add_argument("--seed", type=int, default=0, help="of the trials (default 0)")
     excitation.add_argument("--out", type=Path, metavar="FOLDER", help="for path, scene, table and picture (default "
                             "results/excite/SCENE)")  # fmt: skip
+
+    code = command(
+        "generate",
+        "cli_generate",
+        "generate",
+        "Write the controller and the plant of a scene as C that compiles by itself, with an example that closes the "
+        "loop and is held against Python's run.",
+    )
+    code.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
+    code.add_argument("--controller", type=Path, metavar="FILE|NAME", help="tuning instead of the scene's own: a "
+                      "file, or a name of pcr-mpc models")  # fmt: skip
+    code.add_argument("--solver", choices=("osqp", "daqp"), help="QP solver (default: the tuning's)")
+    code.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default build/NAME)")
 
     timing = command(
         "timing",

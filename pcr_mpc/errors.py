@@ -83,6 +83,10 @@ class CompilerError(PCRError):
     """No machine code could be made of a graph; ``command`` is what was run."""
 
 
+class GenerationError(PCRError, ValueError):
+    """C cannot be generated of a scene: ``part`` is what it does not have yet."""
+
+
 class NoRungError(PCRError):
     """No rung of the ladder of physics meets a scene's ``need``: ``best_error`` [m], and why each was ``rejected``."""
 

@@ -20,7 +20,7 @@ from .tuning import Tuning
 
 # Price of a row that gives way by its own length, over the cost of the tip's way per radian. The penalty is exact while
 # it exceeds every multiplier, and those are what a limit costs in tracking.
-_PENALTY = 0.154
+PENALTY = 0.154
 _TOLERANCE = 10.0  # times the tuning's: the rows are scaled, and the inputs still right to 0.01 rad/s
 _SLACK_SEEN = 1e-4  # rad or units of a row: less is the solver's tolerance
 
@@ -82,23 +82,14 @@ class LimitedQP:
         self._horizon, self._n, self._dt, self._size = horizon, n, dt, size
         self._kinds = kinds
         self._motor_rows = np.asfortranarray(constraint_matrix(horizon, n).toarray())
-        self._penalty = _PENALTY * tuning.position_weight * reach**2
+        self._penalty = PENALTY * tuning.position_weight * reach**2
         self._groups = np.array(
             [kind for kind in ("rate", "rate change", "angle") for _ in range(size)] + [*kinds] * horizon
         )
         soft = size + horizon * len(kinds)
         self._soft = soft
         rows = 2 * size + soft
-        ties = sp.vstack([sp.csc_matrix((2 * size, 2 * soft)), sp.hstack([sp.identity(soft), -sp.identity(soft)])])
-        matrix = sp.csc_matrix(
-            sp.vstack(
-                [
-                    sp.hstack([sp.csc_matrix(np.ones((rows, size))), ties]),
-                    sp.hstack([sp.csc_matrix((2 * soft, size)), sp.identity(2 * soft)]),
-                ]
-            )
-        )
-        matrix.sort_indices()
+        matrix = soft_pattern(size, soft)
         self._data = matrix.data.copy()
         self._dense = slice(0, rows * size)  # the first columns are stored first, each in full
         self._triangle = np.tril_indices(size)
@@ -225,6 +216,16 @@ class LimitedQP:
         if worst["angle"] <= _SLACK_SEEN:
             del worst["angle"]
         return worst
+
+
+def soft_pattern(size: int, soft: int) -> sp.csc_matrix:
+    """The matrix of a `LimitedQP` of ``size`` inputs and ``soft`` soft rows, with ones where it is dense."""
+    rows = 2 * size + soft
+    ties = sp.vstack([sp.csc_matrix((2 * size, 2 * soft)), sp.hstack([sp.identity(soft), -sp.identity(soft)])])
+    slacks = sp.hstack([sp.csc_matrix((2 * soft, size)), sp.identity(2 * soft)])
+    matrix = sp.csc_matrix(sp.vstack([sp.hstack([sp.csc_matrix(np.ones((rows, size))), ties]), slacks]))
+    matrix.sort_indices()
+    return matrix
 
 
 def active_kinds(y: np.ndarray, groups: np.ndarray) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from ..errors import ConvergenceError, PCRError
 from ..linearisation.linear_model import LinearModels
 from ..linearisation.linearise import linearise
 from ..plant.motion.plant import Plant
+from ..plant.motion.step_graph import StepModel
 from ..plant.statics.equilibrium import Equilibrium
 from .foresight_graph import Places, foresight_graph
 
@@ -115,7 +116,7 @@ class Foresight:
         self.inputs = given = dict(zip(function.name_in(), graph.inputs, strict=True))
         self._outputs = found = dict(zip(function.name_out(), graph.outputs, strict=True))
         ends = dict(zip(found, ends, strict=True))
-        self.rows = {name: _rows(given[name]) for name in ("path", "on_the_way", "payloads")}
+        self.rows = {name: _rows(given[name]) for name in ("path", "on_the_way", "payloads", "records")}
         self.window = _rows(given["window"])
         self.rows |= {"states": self.window[:, : 4 + n], "inputs": self.window[:, 4 + n : -2]}
         given["end_force"] = self.window[-1, -2:]
@@ -126,7 +127,7 @@ class Foresight:
                      if function.index_in(name) < function.index_in(names[0]))  # fmt: skip
         self._memory = graph.memory_in[before : before + sum(given[name].size for name in names)]
         self._next = graph.memory_out[ends["moved_reckoned"] - self._memory.size : ends["moved_reckoned"]]
-        self._records = _rows(given["records"])
+        self._records = self.rows["records"]
         self._decisions = found["decisions"]
         self.corrected, self.strayed = found["corrected"], 0.0
         force = self.corrected[-2:]
@@ -150,6 +151,14 @@ class Foresight:
             signs=found["signs"],
             qp=qp,
         )
+
+    @property
+    def step_models(self) -> tuple[StepModel, StepModel]:
+        """Of the plant that is linearised, and of the one whose rods carry the observed force."""
+        model, target = self._plant.step_model, self._target_plant.step_model
+        assert model is not None
+        assert target is not None
+        return model, target
 
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
         """All rods are in ``pose``, and there is no force."""

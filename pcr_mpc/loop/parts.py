@@ -52,8 +52,12 @@ def resting_model(robot: Robot, model: Model, pose: Equilibrium, period: float) 
 
 def make_gate(scene: Scene, tuning: Tuning, robot: Robot, limits: Limits) -> Gate:
     """Gate for the scene's sensors."""
-    noise = max(scene.tip_noise, tuning.observer.tip_noise if tuning.observer else 0.0)
-    return Gate(robot, limits, scene.period, noise, scene.angle_step, scene.wrapped)
+    return Gate(robot, limits, scene.period, tip_noise(scene, tuning), scene.angle_step, scene.wrapped)
+
+
+def tip_noise(scene: Scene, tuning: Tuning) -> float:
+    """Standard deviation of the measured tip position that a controller reckons with [m]."""
+    return max(scene.tip_noise, tuning.observer.tip_noise if tuning.observer else 0.0)
 
 
 def make_observer(scene: Scene, tuning: Tuning, resting: LinearModel) -> DisturbanceObserver | None:

@@ -89,6 +89,11 @@ class TrackingController(OnTheFly, Remade):
         return self._work.observer
 
     @property
+    def work(self) -> ControlStep:
+        """What is done in each period, with its parts; from `start` on."""
+        return self._work
+
+    @property
     def reference(self) -> InverseDynamics:
         """Inverse dynamics of the scene's reference, from `start` on."""
         return self._reference

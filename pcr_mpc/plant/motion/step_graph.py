@@ -16,11 +16,11 @@ import numpy as np
 from ...buffered import graph_cache
 from ...compiled import compiled as machine_code
 from ..rods.follower import BRANCH_CHANGE
-from ..rods.method import RodMethod, warm_step
+from ..rods.method import RodMethod, warm_calls, warm_step
 from ..rods.numbers import Kind
 from ..statics.weight import robot_weight
 from .integrators import RK4_STAGES, euler_graph, first_half_graph, second_half_graph, stage_graph, stop_graph
-from .mass_matrix import robot_mass
+from .mass_matrix import mass_calls, robot_mass
 
 # Newton iterations for a force, to be tried in this order.
 CORRECTIONS = (1, 2)
@@ -80,10 +80,14 @@ class Motion(ABC):
         Numbers of the robot.
     told, q, f_ext : casadi
         What the motors are told, their angles at the start of the step, and the force on the tip besides its weight.
+    inline : bool
+        Make one list of instructions of the rods, if it is not too long; else calls, for a compiler.
     """
 
-    def __init__(self, model: StepModel, vector: Any, told: Any, q: Any, f_ext: Any) -> None:
-        self.model, self.n = model, model.kind.n_rods
+    def __init__(
+        self, model: StepModel, vector: Any, told: Any, q: Any, f_ext: Any, *, inline: bool = True
+    ) -> None:  # fmt: skip
+        self.model, self.n, self.inline = model, model.kind.n_rods, inline
         self.vector, self.numbers = vector, model.kind.unpack(vector)
         self.of_rods = vector if model.weight == "exact" else model.kind.weightless(vector)
         self._push = f_ext + self.numbers.tip_mass * self.numbers.gravity
@@ -111,7 +115,8 @@ class Motion(ABC):
         if model.weight == "condensed":
             self.force += robot_weight(model.kind)[0](unknowns, q, self.vector)[1][:2]
         if model.inertia == "condensed":
-            self.mass = tuple(robot_mass(model.kind, model.method)(unknowns, q, self.of_rods))
+            of_pose = (robot_mass if self.inline else mass_calls)(model.kind, model.method)
+            self.mass = tuple(of_pose(unknowns, q, self.of_rods))
 
     def advance(self, x: Any) -> Any:
         """State at the end of a step from x, where all is."""
@@ -121,8 +126,8 @@ class Motion(ABC):
 class _WarmMotion(Motion):
     """Rods that start from a memory, in a fixed number of Newton iterations."""
 
-    def __init__(self, memory: Any, corrections: int, *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(self, memory: Any, corrections: int, *args: Any, inline: bool) -> None:
+        super().__init__(*args, inline=inline)
         self._corrections = corrections
         start, force, mass = self.model.widths
         self.start, self.force, mass = ca.vertsplit(memory, [0, start, start + force, start + force + mass])
@@ -138,7 +143,7 @@ class _WarmMotion(Motion):
 
     def follow(self, p: Any, q: Any) -> tuple[Any, Any]:
         model = self.model
-        warm = warm_step(model.kind, model.method, self._corrections)
+        warm = (warm_step if self.inline else warm_calls)(model.kind, model.method, self._corrections)
         self.record, verdict, self.result = warm(ca.vertcat(p, q), self.start, self.of_rods)
         self.verdict += verdict
         self.start = self.record[: model.widths[0]]
@@ -180,7 +185,7 @@ def _rk4(motion: Motion, x: Any) -> Any:
 _INTEGRATORS = {"semi_implicit_euler": _semi_implicit_euler, "velocity_verlet": _velocity_verlet, "rk4": _rk4}
 
 
-def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
+def step_graph(model: StepModel, corrections: int, *, details: bool, inline: bool = True) -> Any:
     """One step from a pose that is solved to the next.
 
     Nothing is decided in here: the caller reads the verdict, and keeps the result or does not (see `limits`).
@@ -191,6 +196,8 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
         Newton iterations for each force.
     details : bool
         Whether record and result are wanted.
+    inline : bool
+        See `Motion`.
 
     Returns
     -------
@@ -199,7 +206,7 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
         at the end of the step (see `warm_step`). A memory is of the pose of its x. u is what the motors are told, f_ext
         comes on top of the tip's weight. The verdict is that of `warm_step`, added up over the solves of the step.
     """
-    motion, arguments, results = _step(model, corrections)
+    motion, arguments, results = _step(model, corrections, inline=inline)
     if details:
         results += [motion.record, motion.result]
     return ca.Function("step", arguments, [ca.densify(r) for r in results])
@@ -208,20 +215,21 @@ def step_graph(model: StepModel, corrections: int, *, details: bool) -> Any:
 @graph_cache(maxsize=16)
 def trail_graph(model: StepModel, corrections: int) -> Any:
     """`step_graph` with, as its last result, the places [p, q, unknowns] of all its solves in one vector."""
-    motion, arguments, results = _step(model, corrections)
+    motion, arguments, results = _step(model, corrections, inline=True)
     return ca.Function("step", arguments, [ca.densify(r) for r in [*results, ca.vertcat(*motion.places)]])
 
 
-def _step(model: StepModel, corrections: int) -> tuple[_WarmMotion, list[Any], list[Any]]:
+def _step(model: StepModel, corrections: int, *, inline: bool) -> tuple[_WarmMotion, list[Any], list[Any]]:
     """Rods on their way through a step, its arguments, and the results that every graph of it has."""
     graphs = [warm_step(model.kind, model.method, corrections)]
     if model.inertia == "condensed":
         graphs.append(robot_mass(model.kind, model.method))
-    symbol: Any = (ca.SX if all(graph.is_a("SXFunction") for graph in graphs) else ca.MX).sym
+    inline = inline and all(graph.is_a("SXFunction") for graph in graphs)
+    symbol: Any = (ca.SX if inline else ca.MX).sym
     n = model.kind.n_rods
     memory, x, given = symbol("memory", sum(model.widths)), symbol("x", 4 + n), symbol("given", n + 2)
     vector = symbol("numbers", model.kind.size)
-    motion = _WarmMotion(memory, corrections, model, vector, given[:n], x[4:], given[n:])
+    motion = _WarmMotion(memory, corrections, model, vector, given[:n], x[4:], given[n:], inline=inline)
     end = motion.advance(x)
     return motion, [memory, x, given, vector], [motion.memory(), end, motion.verdict]
 

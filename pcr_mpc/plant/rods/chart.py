@@ -139,6 +139,12 @@ def rough_critical_load(log_tip_angle: float) -> float:
     return float(np.interp(log_tip_angle, chart.rows, chart.limits))
 
 
+def critical_load_table() -> tuple[np.ndarray, np.ndarray]:
+    """Log tip_angle of each trajectory of the chart, increasing, and lambda_c there (see `rough_critical_load`)."""
+    chart = _chart()
+    return chart.rows, chart.limits
+
+
 def held_shapes(xi: float, eta: float) -> list[HeldShape]:
     """Stable shapes of a rod clamped at the origin along +x with its tip at (xi, eta), in units of L.
 

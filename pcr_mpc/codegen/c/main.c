@@ -1,0 +1,162 @@
+/* Closes the loop of the scene with the generated plant, and holds it against the run that Python recorded. */
+#define _POSIX_C_SOURCE 199309L
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "pcr.h"
+#include "pcr_vectors.h"
+
+static pcr_controller controller;
+static pcr_plant plant;
+
+static double now_us(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+    return 1e6 * (double)t.tv_sec + 1e-3 * (double)t.tv_nsec;
+}
+
+static int by_size(const void *a, const void *b)
+{
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+static void show(const char *name, double *times, int count)
+{
+    static const double shares[] = {0.5, 0.95, 0.99, 0.999, 1.0};
+    qsort(times, (size_t)count, sizeof *times, by_size);
+    printf("%-14s", name);
+    for (int i = 0; i < 5; i++) {
+        printf("%10.2f", times[(int)(shares[i] * (count - 1))]);
+    }
+    printf("%10d\n", count);
+}
+
+/* What the sensors say of the plant in period k; noise is that of the recorded run. */
+static void measure(int k, pcr_measurement *measured)
+{
+    memset(measured, 0, sizeof *measured);
+    memcpy(measured->p, plant.x, sizeof measured->p);
+    memcpy(measured->v, plant.x + 2, sizeof measured->v);
+    memcpy(measured->q, plant.x + 4, sizeof measured->q);
+    for (int i = 0; i < 2; i++) {
+        measured->p[i] += pcr_vector_noise[k][i];
+    }
+    for (int i = 0; i < PCR_N && PCR_ANGLE_STEP > 0.0; i++) {
+        measured->q[i] = PCR_ANGLE_STEP * rint(measured->q[i] / PCR_ANGLE_STEP);
+    }
+    for (int i = 0; i < PCR_N && PCR_WRAPPED; i++) {
+        const double turn = 6.283185307179586477;
+        measured->q[i] -= turn * ceil(measured->q[i] / turn - 0.5);
+    }
+}
+
+/* One run of the scene; times of control steps and plant steps are added to those that are there. */
+static int run(double *control, double *steps, double *square, double *away, int *others)
+{
+    double on_the_way[PCR_REAL_DELAY + 1][PCR_N] = {{0.0}};
+    pcr_measurement measured;
+    pcr_output output;
+    if (pcr_controller_init(&controller, NULL) != PCR_OK || pcr_plant_init(&plant, NULL) != PCR_OK) {
+        return 1;
+    }
+    *square = hypot(plant.x[0] - pcr_vector_wanted[0][0], plant.x[1] - pcr_vector_wanted[0][1]);
+    *square *= *square;
+    *away = 0.0;
+    *others = 0;
+    for (int k = 0, step = 0; k < PCR_PERIODS; k++) {
+        measure(k, &measured);
+        double began = now_us();
+        const pcr_result result = pcr_controller_step(&controller, &measured, &output);
+        control[k] = now_us() - began;
+        if (result != PCR_OK) {
+            printf("control step %d: result %d\n", k, (int)result);
+            return 1;
+        }
+        for (int i = 0; i < PCR_N; i++) {
+            *away = fmax(*away, fabs(output.u[i] - pcr_vector_u[k][i]));
+        }
+        *others += (int)output.rung != pcr_vector_rung[k] || output.iterations != pcr_vector_iterations[k];
+        memcpy(on_the_way[PCR_REAL_DELAY], output.u, sizeof output.u);
+        for (int j = 0; j < PCR_STEPS_A_PERIOD; j++, step++) {
+            if (pcr_vector_payload[step] != plant.payload && pcr_plant_carry(&plant, pcr_vector_payload[step])) {
+                return 1;
+            }
+            began = now_us();
+            const pcr_result moved = pcr_plant_step(&plant, on_the_way[0], pcr_vector_force);
+            steps[step] = now_us() - began;
+            if (moved != PCR_OK) {
+                printf("plant step %d: result %d\n", step, (int)moved);
+                return 1;
+            }
+            const double ex = plant.x[0] - pcr_vector_wanted[step + 1][0];
+            const double ey = plant.x[1] - pcr_vector_wanted[step + 1][1];
+            *square += ex * ex + ey * ey;
+        }
+        memmove(on_the_way[0], on_the_way[1 - (PCR_REAL_DELAY == 0)], PCR_REAL_DELAY * sizeof output.u);
+    }
+    return 0;
+}
+
+/* The recorded measurements once more, whatever the plant: inputs, rungs and iterations of each period. */
+static int replay(double *away, int *others)
+{
+    pcr_measurement measured;
+    pcr_output output;
+    memset(&measured, 0, sizeof measured);
+    *away = 0.0;
+    *others = 0;
+    if (pcr_controller_init(&controller, NULL) != PCR_OK) {
+        return 1;
+    }
+    for (int k = 0; k < PCR_PERIODS; k++) {
+        memcpy(measured.p, pcr_vector_measured[k], sizeof measured.p);
+        memcpy(measured.v, pcr_vector_measured[k] + 2, sizeof measured.v);
+        memcpy(measured.q, pcr_vector_measured[k] + 4, sizeof measured.q);
+        if (pcr_controller_step(&controller, &measured, &output) != PCR_OK) {
+            return 1;
+        }
+        for (int i = 0; i < PCR_N; i++) {
+            *away = fmax(*away, fabs(output.u[i] - pcr_vector_u[k][i]));
+        }
+        *others += (int)output.rung != pcr_vector_rung[k] || output.iterations != pcr_vector_iterations[k];
+    }
+    return 0;
+}
+
+int main(int count, char **words)
+{
+    /* ./example 100000: so many control steps are timed, in as many runs as that takes. */
+    const int wanted = count > 1 ? atoi(words[1]) : PCR_PERIODS, runs = (wanted + PCR_PERIODS - 1) / PCR_PERIODS;
+    const int periods = runs * PCR_PERIODS, per = PCR_STEPS_A_PERIOD;
+    double *control = malloc(sizeof *control * (size_t)periods);
+    double *steps = malloc(sizeof *steps * (size_t)(periods * per));
+    double square = 0.0, away = 0.0, replayed = 0.0;
+    int others = 0, other_rungs = 0, failed = control == NULL || steps == NULL || runs < 1;
+    for (int i = 0; i < runs && !failed; i++) {
+        failed = run(control + i * PCR_PERIODS, steps + i * PCR_PERIODS * per, &square, &away, &others);
+    }
+    if (failed || replay(&replayed, &other_rungs)) {
+        printf("failed\n");
+        return 1;
+    }
+    const double rms = 1e3 * sqrt(square / (PCR_PERIODS * per + 1));
+    printf("RMS error of the tip        %.12f mm\n", rms);
+    printf("recorded by Python          %.12f mm, difference %.2g mm\n", pcr_vector_rms_mm, rms - pcr_vector_rms_mm);
+    printf("rates, closed loop          differ by at most %.2g rad/s, rung or iterations in %d of %d periods\n", away,
+           others, PCR_PERIODS);
+    printf("rates, same measurements    differ by at most %.2g rad/s, rung or iterations in %d of %d periods\n",
+           replayed, other_rungs, PCR_PERIODS);
+    printf("\nCPU time [us]        p50       p95       p99     p99.9       max     steps\n");
+    show("control step", control, periods);
+    show("plant step", steps, periods * per);
+    printf("\ncontroller %lu bytes, plant %lu bytes\n", pcr_controller_size(), pcr_plant_size());
+    free(control);
+    free(steps);
+    return fabs(rms - pcr_vector_rms_mm) <= 1e-9 && replayed <= 1e-9 && other_rungs == 0 ? 0 : 2;
+}

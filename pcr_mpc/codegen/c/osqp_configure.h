@@ -1,0 +1,8 @@
+/* How OSQP is built: matrices may change, and nothing is allocated or printed. */
+#ifndef OSQP_CONFIGURE_H
+#define OSQP_CONFIGURE_H
+
+#define OSQP_ALGEBRA_BUILTIN
+#define OSQP_EMBEDDED_MODE 2
+
+#endif

@@ -1,0 +1,318 @@
+/* One control step: what is believed, what lies ahead, the plan, and what is foreseen for the next step. */
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#include "pcr_graphs.h"
+#include "pcr_parts.h"
+
+#define SAME_ANGLE 1e-9
+
+static pcr_room room_of(pcr_controller *c)
+{
+    pcr_room room;
+    room.arg = c->arg;
+    room.res = c->res;
+    room.iw = c->iw;
+    room.w = c->w;
+    return room;
+}
+
+static void foresee(pcr_controller *c)
+{
+    for (int i = 0; i < PCR_INS; i++) {
+        c->arg[i] = c->in + pcr_in_places[i];
+    }
+    for (int i = 0; i < PCR_OUTS; i++) {
+        c->res[i] = c->out + pcr_out_places[i];
+    }
+    pcr_graph_foresight(c->arg, c->res, c->iw, c->w);
+}
+
+/* Take the long way for rods that have not followed, one place after the other. Returns 0 if all have. */
+static int bring_along(pcr_controller *c)
+{
+    const double *good = c->out + PCR_OUT_GOOD;
+    double result[PCR_RESULT];
+    for (int j = 0; j < PCR_PLACES; j++) {
+        if (good[j] < 1.0) {
+            double x[PCR_STATES], *record = c->in + PCR_IN_RECORDS + j * PCR_RECORD;
+            memcpy(x, c->out + PCR_OUT_PLACES + j * PCR_STATES, sizeof x);
+            if (pcr_follow(pcr_graph_follow, pcr_graph_finish, c->parameters.numbers, x, x + 4, 1e-6, record, result,
+                           room_of(c))) {
+                return 1;
+            }
+            foresee(c);
+            if (good[j] < 1.0) {
+                return 1;
+            }
+        }
+    }
+    if (good[PCR_PLACES] < 1.0) {
+        const double *end = c->in + PCR_IN_WINDOW + (PCR_HORIZON - 1) * PCR_ROW, *shift = c->in + PCR_IN_SHIFT;
+        double q[PCR_N];
+        for (int i = 0; i < PCR_N; i++) {
+            q[i] = end[4 + i] + shift[i];
+        }
+        if (!pcr_follow(pcr_graph_target_follow, pcr_graph_target_finish, c->in + PCR_IN_TARGET_NUMBERS, end, q, 1e-2,
+                        c->in + PCR_IN_TARGET, result, room_of(c))) {
+            foresee(c);
+        }
+    }
+    return 0;
+}
+
+static void write_parameters(pcr_controller *c)
+{
+    const pcr_parameters *of = &c->parameters;
+    double *in = c->in, *check = c->check_in;
+    memcpy(in + PCR_IN_NUMBERS, of->numbers, sizeof of->numbers);
+    memcpy(in + PCR_IN_TARGET_NUMBERS, of->numbers, sizeof of->numbers);
+    memcpy(in + PCR_IN_WEIGHTS, of->weights, sizeof of->weights);
+    memcpy(in + PCR_IN_TERMINAL, of->terminal, sizeof of->terminal);
+    memcpy(in + PCR_IN_GAIN, of->observer_gain, sizeof of->observer_gain);
+    in[PCR_IN_HALF_STEP] = PCR_OBSERVER ? PCR_ANGLE_STEP / 2.0 : 0.0;
+    in[PCR_IN_CARRIES] = PCR_OBSERVER;
+    in[PCR_IN_DT] = PCR_PERIOD;
+    for (int i = 0; i < PCR_N; i++) {
+        in[PCR_IN_BOUNDS + i] = of->rate;
+        in[PCR_IN_BOUNDS + PCR_N + i] = of->rate_change;
+        in[PCR_IN_BOUNDS + 2 * PCR_N + i] = of->angle_lower[i];
+        in[PCR_IN_BOUNDS + 3 * PCR_N + i] = of->angle_upper[i];
+    }
+    memcpy(check + PCR_CHECK_BOUNDS, in + PCR_IN_BOUNDS, 4 * PCR_N * sizeof *in);
+    c->clear = pcr_clear_way(of);
+    check[PCR_CHECK_DT] = PCR_PERIOD;
+    check[PCR_CHECK_CLEAR] = c->clear;
+}
+
+static int sound(const pcr_parameters *p)
+{
+    const double *all = (const double *)p;
+    const double *bound = &p->rate; /* from here on infinite ones are none */
+    for (const double *at = all; at < bound; at++) {
+        if (!isfinite(*at)) {
+            return 0;
+        }
+    }
+    for (const double *at = bound; at < all + sizeof *p / sizeof *all; at++) {
+        if (isnan(*at)) {
+            return 0;
+        }
+    }
+    return p->rate > 0.0 && p->rate_change > 0.0;
+}
+
+pcr_result pcr_controller_init(pcr_controller *c, const pcr_pose *pose)
+{
+    const pcr_pose *at = pose == NULL ? &pcr_scene_pose : pose;
+    double result[PCR_RESULT];
+    if (c == NULL) {
+        return PCR_ARGUMENT;
+    }
+    memset(c, 0, sizeof *c);
+    c->parameters = pcr_scene_parameters;
+    double *x = c->in + PCR_IN_ESTIMATE, *record = c->in + PCR_IN_RECORDS, *target = c->in + PCR_IN_TARGET;
+    memcpy(x, at->p, sizeof at->p);
+    memcpy(x + 4, at->q, sizeof at->q);
+    for (int i = 0; i < PCR_STATES; i++) {
+        if (!isfinite(x[i])) {
+            return PCR_ARGUMENT;
+        }
+    }
+    memcpy(record, pcr_scene_record, sizeof pcr_scene_record);
+    memcpy(target, pcr_scene_target_record, sizeof pcr_scene_target_record);
+    memcpy(c->predicts, pcr_scene_model, sizeof pcr_scene_model);
+    memcpy(c->in + PCR_IN_MASS, pcr_scene_mass, sizeof pcr_scene_mass);
+    if (pose != NULL) {
+        if (pcr_follow(pcr_graph_follow, pcr_graph_finish, c->parameters.numbers, at->p, at->q, 1e-6, record, result,
+                       room_of(c))
+            || pcr_follow(pcr_graph_target_follow, pcr_graph_target_finish, c->parameters.numbers, at->p, at->q, 1e-6,
+                          target, result, room_of(c))) {
+            return PCR_OUT_OF_REACH;
+        }
+        /* The linear model at rest, about this pose. */
+        double *constant = c->predicts + PCR_STATES * PCR_STATES;
+        for (int i = 0; i < PCR_STATES; i++) {
+            constant[i] = x[i];
+            for (int j = 0; j < PCR_STATES; j++) {
+                constant[i] -= c->predicts[i + PCR_STATES * j] * x[j];
+            }
+        }
+    }
+    for (int j = 1; j < PCR_PLACES; j++) {
+        memcpy(record + j * PCR_RECORD, record, PCR_RECORD * sizeof *record);
+    }
+    memcpy(c->in + PCR_IN_RECKONED, at->q, sizeof at->q);
+    write_parameters(c);
+    pcr_gate_start(c, at->q);
+    pcr_law_reset(c);
+    c->started = 1;
+    return PCR_OK;
+}
+
+pcr_result pcr_controller_set_parameters(pcr_controller *c, const pcr_parameters *parameters)
+{
+    if (c == NULL || !c->started) {
+        return PCR_NOT_STARTED;
+    }
+    if (parameters == NULL || !sound(parameters)) {
+        return PCR_ARGUMENT;
+    }
+    const int has_plan = c->has_plan, has_states = c->has_states, age = c->age;
+    c->parameters = *parameters;
+    write_parameters(c);
+    pcr_law_reset(c);
+    c->has_plan = has_plan;
+    c->has_states = has_states;
+    c->age = age;
+    return PCR_OK;
+}
+
+/* Write what is known in this period besides the measurement. */
+static void tell(pcr_controller *c, const pcr_measurement *measured)
+{
+    double *in = c->in, *window = in + PCR_IN_WINDOW, *path = in + PCR_IN_PATH;
+    for (int j = 0; j < PCR_DELAY; j++) {
+        memcpy(in + PCR_IN_ON_THE_WAY + j * PCR_N, c->on_the_way[j], sizeof c->on_the_way[j]);
+    }
+    memcpy(in + PCR_IN_U_PREVIOUS, c->u, sizeof c->u);
+    if (measured->window != NULL) {
+        memcpy(window, measured->window, PCR_HORIZON * PCR_ROW * sizeof *window);
+    } else {
+        for (int k = 0; k < PCR_HORIZON; k++) {
+            const int row = c->period + PCR_DELAY + k;
+            memcpy(window + k * PCR_ROW, c->period < PCR_PERIODS ? pcr_scene_reference[row] : pcr_scene_end,
+                   PCR_ROW * sizeof *window);
+        }
+    }
+    if (measured->payloads != NULL) {
+        memcpy(in + PCR_IN_PAYLOADS, measured->payloads, PCR_PLACES * sizeof *in);
+    } else {
+        for (int j = 0; j < PCR_PLACES; j++) {
+            const int row = c->period + j, last = PCR_PAYLOAD_ROWS - 1;
+            in[PCR_IN_PAYLOADS + j] = pcr_scene_payloads[row < last ? row : last];
+        }
+    }
+    for (int k = 0; k < PCR_MODELS - 1; k++) {
+        /* The last plan, one period on; at the start the reference. */
+        memcpy(path + k * PCR_STATES, c->has_plan && c->has_states ? c->states[k + 2] : window + k * PCR_ROW,
+               PCR_STATES * sizeof *path);
+    }
+}
+
+/* State one period later by a linear model. */
+static void predict(const double *model, const double *x, const double *u, double *next)
+{
+    const double *constant = model + PCR_STATES * PCR_STATES, *b = constant + PCR_STATES;
+    double moved[PCR_STATES];
+    for (int i = 0; i < PCR_STATES; i++) {
+        moved[i] = constant[i];
+        for (int j = 0; j < PCR_STATES; j++) {
+            moved[i] += model[i + PCR_STATES * j] * x[j];
+        }
+        for (int j = 0; j < PCR_N; j++) {
+            moved[i] += b[i + PCR_STATES * j] * u[j];
+        }
+    }
+    memcpy(next, moved, sizeof moved);
+}
+
+pcr_result pcr_controller_step(pcr_controller *c, const pcr_measurement *measured, pcr_output *output)
+{
+    if (c == NULL || !c->started) {
+        return PCR_NOT_STARTED;
+    }
+    if (measured == NULL || output == NULL) {
+        return PCR_ARGUMENT;
+    }
+    memset(output, 0, sizeof *output);
+    const pcr_result believed = pcr_believe(c, measured, &output->doubts);
+    if (believed != PCR_OK) {
+        output->rung = PCR_HOLD;
+        output->solver = PCR_QP_NO_MODEL;
+        return believed;
+    }
+    tell(c, measured);
+    foresee(c);
+    double *in = c->in, *out = c->out, *ahead = out + PCR_OUT_AHEAD;
+    const double strayed = out[PCR_OUT_DECISIONS + 1];
+    double corrected[PCR_STATES + 2], foreseen[PCR_STATES];
+    pcr_pose_limits limits;
+    limits.kinds = limits.count = 0;
+    /* So written that NaN is a failure. */
+    int failed = !(out[PCR_OUT_DECISIONS] >= 1.0) && bring_along(c);
+    memcpy(corrected, out + PCR_OUT_CORRECTED, sizeof corrected);
+    if (!failed) {
+        /* What the next period starts from: in it each place is where its neighbour is now. */
+        memcpy(in + PCR_IN_RECORDS, out + PCR_OUT_NEXT, PCR_NEXT * sizeof *in);
+        failed = pcr_near(c, &limits);
+    } else {
+        memcpy(in + PCR_IN_RECKONED, out + PCR_OUT_RECKONED, PCR_N * sizeof *in);
+    }
+    if (failed) {
+        double wanted[PCR_STATES];
+        memcpy(wanted, in + PCR_IN_WINDOW, sizeof wanted);
+        for (int i = 0; i < PCR_N; i++) {
+            wanted[4 + i] += in[PCR_IN_SHIFT + i];
+        }
+        pcr_fall_back(c, corrected, wanted, in + PCR_IN_WINDOW, output);
+        output->solver = PCR_QP_NO_MODEL;
+        ahead = corrected;
+    } else {
+        pcr_decide(c, &limits, output);
+    }
+
+    /* The first rates within the stops for the sum of the commands too: a wrong angle may be measured. */
+    double u[PCR_N];
+    memcpy(u, c->inputs[0], sizeof u);
+    int as_planned = 1;
+    if (failed || !(strayed <= SAME_ANGLE)) {
+        pcr_kept(c, c->inputs[0], c->u, ahead + 4, out + PCR_OUT_RECKONED, u);
+        for (int i = 0; i < PCR_N; i++) {
+            as_planned = as_planned && u[i] == c->inputs[0][i];
+        }
+        output->active |= as_planned ? 0 : PCR_LIMIT_ANGLE;
+    }
+    memcpy(output->inputs, c->inputs, sizeof output->inputs);
+    memcpy(output->inputs[0], u, sizeof u);
+    memcpy(c->u, u, sizeof u);
+    memcpy(c->on_the_way[PCR_DELAY], u, sizeof u);
+    memcpy(c->turning, c->on_the_way[0], sizeof u);
+    memmove(c->on_the_way[0], c->on_the_way[1 - (PCR_DELAY == 0)], PCR_DELAY * sizeof u);
+
+    /* The state at the next measurement. */
+    const int fallen = output->rung != PCR_SOLVED;
+    if (!failed && PCR_DELAY) {
+        memcpy(c->predicts, out + PCR_OUT_NOW, sizeof c->predicts);
+        memcpy(foreseen, out + PCR_OUT_ARRIVING, sizeof foreseen);
+    } else {
+        if (!failed) {
+            memcpy(c->predicts, out + PCR_OUT_MODELS, sizeof c->predicts);
+        }
+        if (as_planned && !PCR_DELAY && c->has_states && !fallen) {
+            memcpy(foreseen, c->states[1], sizeof foreseen);
+        } else {
+            predict(c->predicts, corrected, c->turning, foreseen);
+        }
+    }
+    memcpy(output->u, u, sizeof u);
+    memcpy(output->estimate, corrected, sizeof output->estimate);
+    memcpy(output->force, corrected + PCR_STATES, sizeof output->force);
+    output->stiffness = out[PCR_OUT_SIGNS];
+    memcpy(output->torque, out + PCR_OUT_SIGNS + 1, sizeof output->torque);
+    for (int k = 0; k <= PCR_HORIZON; k++) {
+        for (int i = 0; i < PCR_STATES; i++) {
+            output->states[k][i] = c->has_states ? c->states[k][i] : NAN;
+        }
+    }
+    memcpy(in + PCR_IN_ESTIMATE, foreseen, sizeof foreseen);
+    memcpy(in + PCR_IN_ESTIMATE + PCR_STATES, corrected + PCR_STATES, 2 * sizeof *in);
+    c->period += c->period < PCR_PERIODS + PCR_PAYLOAD_ROWS;
+    return PCR_OK;
+}
+
+unsigned long pcr_controller_size(void)
+{
+    return sizeof(pcr_controller);
+}

@@ -1,0 +1,24 @@
+/* The functions that CasADi has written: arg and res point to inputs and outputs, iw and w are memory to work in. */
+#ifndef PCR_GRAPHS_H
+#define PCR_GRAPHS_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+int pcr_graph_foresight(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_check(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_follow(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_finish(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_target_follow(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_target_finish(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_plant_once(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_plant_twice(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_tip_map(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_curvature(const double **arg, double **res, long long *iw, double *w);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

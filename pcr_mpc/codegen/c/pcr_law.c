@@ -1,0 +1,335 @@
+/* The linear MPC from its QP on, and the ladder below it. */
+#include <math.h>
+#include <string.h>
+
+#include "pcr_graphs.h"
+#include "pcr_parts.h"
+
+#define JUMP 1e3
+#define SLIGHT 1e-6
+#define FEWEST_ITERATIONS 10
+#define COUNTS 1e-9
+#define UNIT (100.0 * PCR_PERIOD)
+
+static const pcr_qp_settings rates_settings = {PCR_TOLERANCE, PCR_MAX_ITERATIONS};
+
+static void reset_rates(pcr_controller *c)
+{
+    pcr_qp_setup(&c->rates, &pcr_rates_shape, &rates_settings, pcr_rates_starts, pcr_rates_rows, pcr_rates_values,
+                 c->rates_doubles, c->rates_ints);
+}
+
+static void reset_solvers(pcr_controller *c)
+{
+    c->limits_matter = 0;
+    reset_rates(c);
+    pcr_limited_reset(&c->limited, PCR_PENALTY * c->parameters.weights[0] * c->parameters.reach * c->parameters.reach);
+}
+
+void pcr_law_reset(pcr_controller *c)
+{
+    c->has_plan = c->has_states = c->has_models = c->has_problem = 0;
+    c->age = -1;
+    reset_solvers(c);
+}
+
+/* Evaluate what inputs lead to; the problem, or models and x alone, lie in check_in. */
+static void check(pcr_controller *c)
+{
+    static const int places[] = {PCR_CHECK_MODELS, PCR_CHECK_X, PCR_CHECK_P, PCR_CHECK_Q, PCR_CHECK_L, PCR_CHECK_U,
+                                 PCR_CHECK_BOUNDS, PCR_CHECK_DT, PCR_CHECK_CLEAR, PCR_CHECK_INPUTS, PCR_CHECK_Y};
+    for (int i = 0; i < (int)(sizeof places / sizeof *places); i++) {
+        c->arg[i] = c->check_in + places[i];
+    }
+    c->res[0] = c->check_out;
+    c->res[1] = c->check_out + (PCR_HORIZON + 1) * PCR_STATES;
+    pcr_graph_check(c->arg, c->res, c->iw, c->w);
+}
+
+/* States of the plan that stands in c->inputs. */
+static void predict_states(pcr_controller *c, const double *models, const double *x)
+{
+    memcpy(c->check_in + PCR_CHECK_MODELS, models, PCR_MODELS * PCR_MODEL * sizeof *models);
+    memcpy(c->check_in + PCR_CHECK_X, x, PCR_STATES * sizeof *x);
+    memcpy(c->check_in + PCR_CHECK_INPUTS, c->inputs, sizeof c->inputs);
+    check(c);
+    memcpy(c->states, c->check_out, sizeof c->states);
+}
+
+/* Whether the last solution is a start for a problem of these sizes; NaN continues nothing. */
+static int continues(const pcr_controller *c, double hessian, double gradient)
+{
+    const double rate = c->parameters.rate;
+    if (!c->has_problem) {
+        return 1;
+    }
+    if (!(hessian <= JUMP * c->hessian && JUMP * c->hessian <= JUMP * JUMP * hessian)) {
+        return 0;
+    }
+    if (c->gradient <= JUMP * gradient) {
+        return 1;
+    }
+    const double slight = SLIGHT * hessian * (rate < INFINITY ? rate : 1.0 / UNIT);
+    return gradient < slight && c->gradient <= JUMP * slight;
+}
+
+static int active_of(const double *pulls, const int *bits, int count)
+{
+    double largest = 0.0;
+    int active = 0;
+    for (int i = 0; i < count; i++) {
+        largest = pulls[i] > largest ? pulls[i] : largest;
+    }
+    for (int i = 0; i < count && largest >= COUNTS; i++) {
+        active |= pulls[i] > 1e-6 * largest ? bits[i] : 0;
+    }
+    return active;
+}
+
+/* Solve with the rows of the rates alone. Returns 1 if that is the answer. */
+static int solve_rates(pcr_controller *c, const pcr_pose_limits *limits, const double *warm, int *spent,
+                       double *inputs, int *kept, pcr_output *output)
+{
+    static const int bits[2] = {PCR_LIMIT_RATE, PCR_LIMIT_RATE_CHANGE};
+    const double rate = 1.0 / UNIT;
+    double *in = c->check_in, *p = in + PCR_CHECK_P, *q = in + PCR_CHECK_Q, *l = in + PCR_CHECK_L;
+    double *u = in + PCR_CHECK_U, start[PCR_INPUTS];
+    double scaled[PCR_TRIANGLE + PCR_INPUTS + 4 * PCR_INPUTS];
+    int left, sound = c->out[PCR_OUT_DECISIONS + 4] > 0.0;
+    if (rate != 1.0) {
+        double *to = scaled;
+        for (int i = 0; i < PCR_TRIANGLE; i++) {
+            *to++ = rate * rate * p[i];
+        }
+        for (int i = 0; i < PCR_INPUTS; i++) {
+            *to++ = rate * q[i];
+        }
+        for (int i = 0; i < 2 * PCR_INPUTS; i++) {
+            *to++ = l[i] / rate;
+        }
+        for (int i = 0; i < 2 * PCR_INPUTS; i++) {
+            *to++ = u[i] / rate;
+        }
+        p = scaled;
+        q = p + PCR_TRIANGLE;
+        l = q + PCR_INPUTS;
+        u = l + 2 * PCR_INPUTS;
+    }
+    if (!sound) {
+        output->solver = PCR_QP_CROSSED;
+        for (int i = 0; i < PCR_TRIANGLE; i++) {
+            if (!isfinite(p[i])) {
+                output->solver = PCR_QP_NOT_CONVEX;
+                return 0;
+            }
+        }
+        for (int i = 0; i < 2 * PCR_INPUTS; i++) {
+            if (!(l[i] <= u[i]) || (i < PCR_INPUTS && !isfinite(q[i]))) {
+                return 0;
+            }
+        }
+    }
+    left = pcr_qp_update(&c->rates, p, NULL, q, l, u);
+    if (left) {
+        output->solver = (pcr_qp_status)left;
+        reset_rates(c);
+        return 0;
+    }
+    if (warm != NULL) {
+        for (int i = 0; i < PCR_INPUTS; i++) {
+            start[i] = warm[i] / rate;
+        }
+        pcr_qp_warm_start(&c->rates, start, NULL);
+    }
+    int iterations;
+    left = pcr_qp_solve(&c->rates, PCR_MAX_ITERATIONS, &iterations);
+    *spent = iterations;
+    if (left) {
+        output->solver = (pcr_qp_status)left;
+        return 0;
+    }
+    for (int i = 0; i < PCR_INPUTS; i++) {
+        in[PCR_CHECK_INPUTS + i] = inputs[i] = rate * c->rates.solution.x[i];
+    }
+    for (int i = 0; i < 2 * PCR_INPUTS; i++) {
+        in[PCR_CHECK_Y + i] = c->rates.solution.y[i] / rate;
+    }
+    check(c);
+    const double *found = c->check_out + (PCR_HORIZON + 1) * PCR_STATES;
+    double broken = found[2];
+    for (int k = 1; k <= PCR_HORIZON; k++) {
+        for (int i = 0; i < limits->count; i++) {
+            double value = 0.0;
+            for (int j = 0; j < PCR_STATES; j++) {
+                value += limits->c[i][j] * c->check_out[k * PCR_STATES + j];
+            }
+            broken = fmax(broken, fmax(limits->lower[i] - value, value - limits->upper[i]));
+        }
+    }
+    if (!(broken <= PCR_TOLERANCE * rate * PCR_PERIOD)) {
+        return 0;
+    }
+    const double pulls[2] = {rate * found[3], rate * found[4]};
+    output->active = active_of(pulls, bits, 2);
+    output->primal_residual = found[0] / rate;
+    output->dual_residual = rate * found[1];
+    output->iterations = iterations;
+    output->solver = PCR_QP_SOLVED;
+    *kept = found[5] > 0.0;
+    memcpy(c->states, c->check_out, sizeof c->states);
+    return 1;
+}
+
+/* Solve with everything; returns 0 if that is the answer. */
+static int solve_whole(pcr_controller *c, const pcr_pose_limits *limits, const double *warm, int soft_angles,
+                       int *spent, double *inputs, pcr_output *output)
+{
+    const double *in = c->check_in;
+    int bits[3 + PCR_POSE_KINDS] = {PCR_LIMIT_RATE, PCR_LIMIT_RATE_CHANGE, PCR_LIMIT_ANGLE};
+    pcr_limited_answer answer;
+    if (PCR_MAX_ITERATIONS - *spent < FEWEST_ITERATIONS) {
+        output->solver = PCR_QP_ITERATIONS;
+        return 1;
+    }
+    pcr_limited_solve(&c->limited, in + PCR_CHECK_P, in + PCR_CHECK_Q, in + PCR_CHECK_L, in + PCR_CHECK_U,
+                      in + PCR_CHECK_MODELS, in + PCR_CHECK_X, PCR_PERIOD, limits->count ? limits : NULL, soft_angles,
+                      warm, PCR_MAX_ITERATIONS - *spent, &answer);
+    *spent += answer.iterations;
+    output->solver = (pcr_qp_status)answer.left;
+    if (answer.left) {
+        return 1;
+    }
+    for (int k = 0; k < PCR_POSE_KINDS; k++) {
+        bits[3 + k] = pcr_kind_bits[k];
+    }
+    output->active = active_of(answer.pull, bits, 3 + PCR_POSE_KINDS);
+    output->iterations = *spent;
+    output->primal_residual = answer.primal_residual;
+    output->dual_residual = answer.dual_residual;
+    c->limits_matter = (output->active & ~(PCR_LIMIT_RATE | PCR_LIMIT_RATE_CHANGE)) != 0;
+    for (int k = 0; k <= PCR_POSE_KINDS; k++) {
+        const int bit = bits[2 + k];
+        for (int b = 0; b < 8; b++) {
+            if (bit == 1 << b && answer.slack[k] > 0.0) {
+                output->slack[b] = answer.slack[k];
+                output->rung = PCR_SOFTENED;
+            }
+        }
+    }
+    memcpy(inputs, answer.inputs, sizeof answer.inputs);
+    return 0;
+}
+
+void pcr_decide(pcr_controller *c, const pcr_pose_limits *limits, pcr_output *output)
+{
+    const double *out = c->out, *x = out + PCR_OUT_AHEAD;
+    const double hessian = out[PCR_OUT_DECISIONS + 2], gradient = out[PCR_OUT_DECISIONS + 3];
+    double shifted[PCR_INPUTS], inputs[PCR_INPUTS];
+    const double *warm = NULL;
+    int spent = 0, kept = 0, solved = 0;
+    if (!continues(c, hessian, gradient)) {
+        c->has_plan = c->has_states = c->has_models = c->has_problem = 0;
+        c->age = -1;
+        reset_solvers(c);
+    }
+    if (c->has_plan && c->has_problem) {
+        memcpy(shifted, c->inputs[PCR_HORIZON > 1 ? 1 : 0], (PCR_INPUTS - PCR_N) * sizeof *shifted);
+        memcpy(shifted + PCR_INPUTS - PCR_N, c->inputs[PCR_HORIZON - 1], PCR_N * sizeof *shifted);
+        warm = shifted;
+    }
+    c->has_problem = 1;
+    c->hessian = hessian;
+    c->gradient = gradient;
+    memcpy(c->check_in, out + PCR_OUT_MODELS, PCR_CHECK_BOUNDS * sizeof *out); /* models to bounds */
+
+    output->rung = PCR_SOLVED;
+    if (!c->limits_matter) {
+        solved = solve_rates(c, limits, warm, &spent, inputs, &kept, output);
+        if (!solved && spent && output->solver == PCR_QP_SOLVED) {
+            memcpy(shifted, inputs, sizeof shifted);
+            warm = shifted;
+        }
+    }
+    const int predicted = solved;
+    if (!solved) {
+        kept = 0;
+        if (solve_whole(c, limits, warm, 0, &spent, inputs, output)) {
+            const pcr_qp_status why = output->solver;
+            if (solve_whole(c, limits, NULL, 1, &spent, inputs, output)) {
+                pcr_fall_back(c, x, out + PCR_OUT_WANTED, c->in + PCR_IN_WINDOW, output);
+                return;
+            }
+            output->rung = PCR_SOFTENED;
+            output->solver = why;
+        }
+    }
+    memcpy(c->inputs, inputs, sizeof inputs);
+    if (!kept) {
+        double first[PCR_N];
+        pcr_kept(c, inputs, c->u, x + 4, NULL, first);
+        if (!predicted || memcmp(first, inputs, sizeof first) != 0) {
+            memcpy(c->inputs[0], first, sizeof first);
+            predict_states(c, out + PCR_OUT_MODELS, x);
+        }
+    }
+    memcpy(c->models, out + PCR_OUT_MODELS, sizeof c->models);
+    c->has_plan = c->has_states = c->has_models = 1;
+    c->age = 0;
+}
+
+/* Rates of the LQR about where the reference is now, one period before its first state. */
+static void lqr(const pcr_controller *c, const double *x, const double *wanted, const double *inputs, double *u)
+{
+    double away[PCR_STATES];
+    for (int i = 0; i < PCR_STATES; i++) {
+        double now = wanted[i];
+        now -= i < 2 ? PCR_PERIOD * wanted[2 + i] : i >= 4 ? PCR_PERIOD * inputs[i - 4] : 0.0;
+        away[i] = x[i] - now;
+    }
+    for (int i = 0; i < PCR_N; i++) {
+        u[i] = inputs[i];
+        for (int j = 0; j < PCR_STATES; j++) {
+            u[i] -= c->parameters.gain[i * PCR_STATES + j] * away[j];
+        }
+    }
+}
+
+void pcr_fall_back(pcr_controller *c, const double *x, const double *wanted, const double *window,
+                   pcr_output *output)
+{
+    int finite = 1;
+    double asked[PCR_N];
+    for (int i = 0; i < PCR_STATES; i++) {
+        finite = finite && isfinite(x[i]);
+    }
+    if (c->has_plan && c->age >= 0 && c->age < PCR_HORIZON - 1) {
+        output->rung = PCR_SHIFTED_PLAN;
+        memmove(c->inputs[0], c->inputs[PCR_HORIZON > 1 ? 1 : 0], (PCR_HORIZON - 1) * sizeof c->inputs[0]);
+    } else {
+        output->rung = finite ? PCR_LQR : PCR_HOLD;
+        memset(c->inputs, 0, sizeof c->inputs);
+        if (finite) {
+            lqr(c, x, wanted, window + PCR_STATES, c->inputs[0]);
+        }
+    }
+    memcpy(asked, c->inputs[0], sizeof asked);
+    pcr_kept(c, asked, c->u, x + 4, NULL, c->inputs[0]);
+    for (int k = output->rung == PCR_SHIFTED_PLAN ? PCR_HORIZON - 1 : 1; k > 0 && k < PCR_HORIZON; k++) {
+        pcr_slowed(c, c->inputs[k - 1], c->inputs[k]);
+    }
+    output->active = 0;
+    for (int i = 0; i < PCR_N; i++) {
+        if (c->inputs[0][i] != asked[i]) {
+            output->active = pcr_met(c, c->inputs[0], c->u);
+        }
+    }
+    memset(output->slack, 0, sizeof output->slack);
+    output->iterations = 0;
+    output->primal_residual = output->dual_residual = NAN;
+    c->age += c->age >= 0;
+    c->has_states = c->has_models = c->has_plan && c->has_models && finite;
+    if (c->has_states) {
+        predict_states(c, c->models, x);
+    }
+    c->has_plan = 1;
+}

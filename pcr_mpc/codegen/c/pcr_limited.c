@@ -1,0 +1,365 @@
+/* The QP with soft rows, in coordinates V = L'U in which its cost is 1/2 |V - V*|^2, every row scaled to length one:
+
+                         V                  s-     s+
+    rates, changes     [ A inv(L')                    ]
+    angles, poses      [ A inv(L')          1      -1 ]
+    slacks             [                    1         ]
+                       [                           1  ]
+
+   One workspace serves all combinations of limits that may be near; what a solver of each would remember is kept. */
+#include "pcr_limited.h"
+
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#include "auxil.h"
+#include "pcr_tables.h"
+
+#define TOLERANCE (10.0 * PCR_TOLERANCE)
+#define SLACK_SEEN 1e-4
+#define MOTOR_ROWS (3 * PCR_INPUTS)
+
+static const pcr_qp_settings settings = {TOLERANCE, PCR_MAX_ITERATIONS};
+
+static int rows_of(int kinds)
+{
+    int count = 0;
+    for (int k = 0; k < PCR_POSE_KINDS; k++) {
+        count += (kinds >> k) & 1 ? pcr_kind_rows[k] : 0;
+    }
+    return count;
+}
+
+void pcr_limited_reset(pcr_limited *limited, double penalty)
+{
+    limited->kinds = -1;
+    limited->penalty = penalty;
+    for (int k = 0; k < 1 << PCR_POSE_KINDS; k++) {
+        limited->kept[k].used = limited->kept[k].solved = 0;
+    }
+}
+
+/* Remember what the solver at work has found. */
+static void put_away(pcr_limited *limited)
+{
+    if (limited->kinds < 0) {
+        return;
+    }
+    const OSQPWorkspace *work = &limited->qp.work;
+    pcr_limited_state *state = &limited->kept[limited->kinds];
+    state->used = 1;
+    state->rho = limited->qp.settings.rho;
+    memcpy(state->x, work->x->values, (size_t)work->x->length * sizeof *state->x);
+    memcpy(state->z, work->z->values, (size_t)work->z->length * sizeof *state->z);
+    memcpy(state->y, work->y->values, (size_t)work->y->length * sizeof *state->y);
+}
+
+/* Let the solver of these kinds go on from where it was. */
+static int fetch(pcr_limited *limited, int kinds)
+{
+    if (limited->kinds == kinds) {
+        return 0;
+    }
+    put_away(limited);
+    limited->kinds = -1;
+    const int size = PCR_INPUTS, soft = size + PCR_HORIZON * rows_of(kinds), rows = 2 * size + soft;
+    int e = 0;
+    for (int j = 0; j < size; j++) {
+        limited->starts[j] = e;
+        for (int i = 0; i < rows; i++, e++) {
+            limited->rows[e] = i;
+            limited->values[e] = 1.0;
+        }
+    }
+    for (int j = 0; j < 2 * soft; j++) {
+        limited->starts[size + j] = e;
+        limited->rows[e] = 2 * size + j % soft;
+        limited->values[e++] = j < soft ? 1.0 : -1.0;
+        limited->rows[e] = rows + j;
+        limited->values[e++] = 1.0;
+    }
+    limited->starts[size + 2 * soft] = e;
+    pcr_qp *qp = &limited->qp;
+    if (pcr_qp_setup(qp, &pcr_limited_shapes[kinds], &settings, limited->starts, limited->rows, limited->values,
+                     limited->doubles, limited->ints)) {
+        return PCR_LEFT_NOT_CONVEX;
+    }
+    const pcr_limited_state *state = &limited->kept[kinds];
+    if (state->used) {
+        memcpy(qp->work.x->values, state->x, (size_t)qp->work.x->length * sizeof *state->x);
+        memcpy(qp->work.z->values, state->z, (size_t)qp->work.z->length * sizeof *state->z);
+        memcpy(qp->work.y->values, state->y, (size_t)qp->work.y->length * sizeof *state->y);
+        memcpy(qp->solution.x, state->x, (size_t)qp->work.x->length * sizeof *state->x);
+        memcpy(qp->solution.y, state->y, (size_t)qp->work.y->length * sizeof *state->y);
+        osqp_update_rho(&qp->solver, state->rho);
+    }
+    limited->kinds = kinds;
+    return 0;
+}
+
+/* L from the upper triangle of P column by column, which is the lower one row by row; 0 if P is positive definite. */
+static int factorise(double factor[PCR_INPUTS][PCR_INPUTS], const double *p)
+{
+    for (int i = 0; i < PCR_INPUTS; i++) {
+        for (int j = 0; j <= i; j++) {
+            double sum = *p++;
+            for (int k = 0; k < j; k++) {
+                sum -= factor[i][k] * factor[j][k];
+            }
+            if (i > j) {
+                factor[i][j] = sum / factor[j][j];
+            } else if (sum > 0.0) { /* not of NaN */
+                factor[i][i] = sqrt(sum);
+            } else {
+                return 1;
+            }
+        }
+    }
+    return 0;
+}
+
+/* Rows of rates, changes of rate and angles; those of poses, over dt, with their bounds. */
+static void stack(pcr_limited *limited, const double *models, const double *x, double dt,
+                  const pcr_pose_limits *limits, double *low, double *high)
+{
+    double (*a)[PCR_LIMITED_ROWS] = limited->stacked;
+    for (int j = 0; j < PCR_INPUTS; j++) {
+        for (int i = 0; i < PCR_INPUTS; i++) {
+            a[j][i] = i == j ? 1.0 : 0.0;
+            a[j][PCR_INPUTS + i] = i == j ? 1.0 : i == j + PCR_N ? -1.0 : 0.0;
+            a[j][2 * PCR_INPUTS + i] = i >= j && (i - j) % PCR_N == 0 ? 1.0 : 0.0;
+        }
+    }
+    if (limits == NULL) {
+        return;
+    }
+    double response[PCR_INPUTS][PCR_STATES] = {{0.0}}, state[PCR_STATES], moved[PCR_STATES];
+    memcpy(state, x, sizeof state);
+    for (int k = 0; k < PCR_HORIZON; k++) {
+        const double *model = models + (PCR_MODELS > 1 ? k : 0) * PCR_MODEL;
+        const double *c = model + PCR_STATES * PCR_STATES, *b = c + PCR_STATES;
+        for (int j = 0; j < (k + 1) * PCR_N; j++) {
+            for (int i = 0; i < PCR_STATES; i++) {
+                moved[i] = j >= k * PCR_N ? b[i + PCR_STATES * (j - k * PCR_N)] : 0.0;
+                for (int l = 0; l < PCR_STATES && j < k * PCR_N; l++) {
+                    moved[i] += model[i + PCR_STATES * l] * response[j][l];
+                }
+            }
+            memcpy(response[j], moved, sizeof moved);
+        }
+        for (int i = 0; i < PCR_STATES; i++) {
+            moved[i] = c[i];
+            for (int l = 0; l < PCR_STATES; l++) {
+                moved[i] += model[i + PCR_STATES * l] * state[l];
+            }
+        }
+        memcpy(state, moved, sizeof state);
+        for (int i = 0; i < limits->count; i++) {
+            const int row = MOTOR_ROWS + k * limits->count + i;
+            double free = 0.0;
+            for (int l = 0; l < PCR_STATES; l++) {
+                free += limits->c[i][l] * state[l];
+            }
+            low[row] = (limits->lower[i] - free) / dt;
+            high[row] = (limits->upper[i] - free) / dt;
+            for (int j = 0; j < PCR_INPUTS; j++) {
+                double sum = 0.0;
+                for (int l = 0; l < PCR_STATES; l++) {
+                    sum += limits->c[i][l] * response[j][l];
+                }
+                a[j][row] = sum / dt;
+            }
+        }
+    }
+}
+
+/* Move multipliers, or slacks, on by one period; the last period's stay. */
+static double *moved_on(double *to, const double *from, int width)
+{
+    for (int i = 0; i < PCR_HORIZON * width; i++) {
+        to[i] = from[i + width < PCR_HORIZON * width ? i + width : i];
+    }
+    return to + PCR_HORIZON * width;
+}
+
+static void start_from(pcr_limited *limited, int count, const double *warm)
+{
+    const int size = PCR_INPUTS;
+    double x[PCR_LIMITED_N] = {0.0}, y[PCR_LIMITED_M] = {0.0};
+    if (limited->kept[limited->kinds].solved) {
+        const double *from = limited->qp.solution.y;
+        double *to = y;
+        for (int block = 0; block < 3; block++) {
+            to = moved_on(to, from + (to - y), PCR_N);
+        }
+        to = moved_on(to, from + (to - y), count);
+        for (int side = 0; side < 2; side++) {
+            to = moved_on(to, from + (to - y), PCR_N);
+            to = moved_on(to, from + (to - y), count);
+        }
+        from = limited->qp.solution.x + size;
+        to = x + size;
+        for (int side = 0; side < 2; side++) {
+            to = moved_on(to, from + (to - x - size), PCR_N);
+            to = moved_on(to, from + (to - x - size), count);
+        }
+    }
+    for (int i = 0; i < size; i++) {
+        for (int j = i; j < size; j++) {
+            x[i] += limited->factor[j][i] * warm[j];
+        }
+    }
+    pcr_qp_warm_start(&limited->qp, x, y);
+}
+
+static double worst(double a, double b)
+{
+    return a > b ? a : b;
+}
+
+static void explain(const pcr_limited *limited, const pcr_pose_limits *limits, double dt, const double *x,
+                    const double *y, pcr_limited_answer *answer)
+{
+    const int size = PCR_INPUTS, count = limits == NULL ? 0 : limits->count, soft = size + PCR_HORIZON * count;
+    memset(answer->pull, 0, sizeof answer->pull);
+    memset(answer->slack, 0, sizeof answer->slack);
+    for (int i = 0; i < 3 * size; i++) {
+        answer->pull[i / size] = worst(answer->pull[i / size], fabs(y[i]));
+    }
+    for (int i = 0; i < soft; i++) {
+        const double given = dt * worst(x[size + i], x[size + soft + i]) * limited->length[2 * size + i];
+        if (i < size) {
+            answer->slack[0] = worst(answer->slack[0], given > SLACK_SEEN ? given : 0.0);
+            continue;
+        }
+        const int row = (i - size) % count, kind = limits->kind[row];
+        answer->pull[3 + kind] = worst(answer->pull[3 + kind], fabs(y[2 * size + i]));
+        if (given * limits->scale[row] > SLACK_SEEN * limits->scale[row]) {
+            answer->slack[1 + kind] = worst(answer->slack[1 + kind], given * limits->scale[row]);
+        }
+    }
+}
+
+/* Residuals of a solution, from the data that were handed over. */
+static void judge(const pcr_limited *limited, int count, const double *x, const double *y, pcr_limited_answer *answer)
+{
+    const int size = PCR_INPUTS, soft = size + PCR_HORIZON * count, rows = 2 * size + soft;
+    double primal = 0.0, dual = 0.0;
+    for (int i = 0; i < rows + 2 * soft; i++) {
+        double value = i >= rows ? x[size + i - rows] : 0.0;
+        for (int j = 0; j < size && i < rows; j++) {
+            value += limited->stacked[j][i] * x[j];
+        }
+        if (i >= 2 * size && i < rows) {
+            value += x[size + i - 2 * size] - x[size + soft + i - 2 * size];
+        }
+        primal = worst(primal, worst(limited->l[i] - value, value - limited->u[i]));
+    }
+    for (int j = 0; j < size + 2 * soft; j++) {
+        double value = x[j] + limited->q[j];
+        for (int i = 0; i < rows && j < size; i++) {
+            value += limited->stacked[j][i] * y[i];
+        }
+        if (j >= size) {
+            const double tied = y[2 * size + (j - size) % soft];
+            value += (j < size + soft ? tied : -tied) + y[rows + j - size];
+        }
+        dual = worst(dual, fabs(value));
+    }
+    answer->primal_residual = primal;
+    answer->dual_residual = dual;
+}
+
+void pcr_limited_solve(pcr_limited *limited, const double *p, const double *q, const double *l, const double *u,
+                       const double *models, const double *x, double dt, const pcr_pose_limits *limits,
+                       int soft_angles, const double *warm, int most, pcr_limited_answer *answer)
+{
+    const int kinds = limits == NULL ? 0 : limits->kinds, count = limits == NULL ? 0 : limits->count;
+    const int size = PCR_INPUTS, soft = size + PCR_HORIZON * count, rows = 2 * size + soft;
+    double (*a)[PCR_LIMITED_ROWS] = limited->stacked;
+
+    answer->iterations = 0;
+    answer->left = PCR_LEFT_NOT_CONVEX;
+    if (factorise(limited->factor, p) || fetch(limited, kinds)) {
+        return;
+    }
+    memcpy(limited->l, l, MOTOR_ROWS * sizeof *l);
+    memcpy(limited->u, u, MOTOR_ROWS * sizeof *u);
+    stack(limited, models, x, dt, limits, limited->l, limited->u);
+    /* A inv(L'), column by column; and L q' = q. */
+    double longest = 0.0;
+    for (int j = 0; j < size; j++) {
+        double sum = q[j];
+        for (int k = 0; k < j; k++) {
+            sum -= limited->factor[j][k] * limited->q[k];
+        }
+        limited->q[j] = sum / limited->factor[j][j];
+        for (int i = 0; i < rows; i++) {
+            double entry = a[j][i];
+            for (int k = 0; k < j; k++) {
+                entry -= limited->factor[j][k] * a[k][i];
+            }
+            a[j][i] = entry / limited->factor[j][j];
+        }
+    }
+    for (int i = 0; i < rows; i++) {
+        double square = 0.0;
+        for (int j = 0; j < size; j++) {
+            square += a[j][i] * a[j][i];
+        }
+        limited->length[i] = sqrt(square);
+        longest = worst(longest, limited->length[i]);
+    }
+    int crossed = 0;
+    for (int i = 0; i < rows; i++) {
+        limited->length[i] = worst(limited->length[i], 1e-12 * longest);
+        limited->l[i] = worst(limited->l[i] / limited->length[i], -OSQP_INFTY);
+        limited->u[i] = -worst(-limited->u[i] / limited->length[i], -OSQP_INFTY);
+        crossed = crossed || !(limited->l[i] <= limited->u[i]);
+        for (int j = 0; j < size; j++) {
+            a[j][i] /= limited->length[i];
+        }
+    }
+    for (int j = 0; j < 2 * soft; j++) {
+        limited->q[size + j] = limited->penalty;
+        limited->l[rows + j] = 0.0;
+        limited->u[rows + j] = j % soft < size && !soft_angles ? 0.0 : OSQP_INFTY;
+    }
+    if (crossed) {
+        answer->left = PCR_LEFT_CROSSED;
+        return;
+    }
+    for (int j = 0; j < size; j++) {
+        memcpy(limited->values + j * rows, a[j], (size_t)rows * sizeof *a[j]);
+    }
+    for (int j = 0, e = size * rows; j < 2 * soft; j++) {
+        limited->values[e++] = j < soft ? 1.0 : -1.0;
+        limited->values[e++] = 1.0;
+    }
+    pcr_qp *qp = &limited->qp;
+    answer->left = pcr_qp_update(qp, NULL, limited->values, limited->q, limited->l, limited->u);
+    if (answer->left) {
+        pcr_limited_reset(limited, limited->penalty);
+        return;
+    }
+    if (warm != NULL) {
+        start_from(limited, count, warm);
+    }
+    limited->kept[kinds].solved = 0;
+    answer->left = pcr_qp_solve(qp, most, &answer->iterations);
+    if (answer->left) {
+        return;
+    }
+    limited->kept[kinds].solved = 1;
+    const double *v = qp->solution.x, *y = qp->solution.y;
+    for (int i = size - 1; i >= 0; i--) {
+        double sum = v[i];
+        for (int k = i + 1; k < size; k++) {
+            sum -= limited->factor[k][i] * answer->inputs[k];
+        }
+        answer->inputs[i] = sum / limited->factor[i][i];
+    }
+    explain(limited, limits, dt, v, y, answer);
+    judge(limited, count, v, y, answer);
+}

@@ -1,0 +1,60 @@
+/* What the files of the runtime share. */
+#ifndef PCR_PARTS_H
+#define PCR_PARTS_H
+
+#include "pcr.h"
+#include "pcr_tables.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* Parts of a record of the rods' pose; what a warm start needs comes first. */
+#define PCR_WIDTH 3
+#define PCR_UNKNOWNS 0
+#define PCR_TANGENTS (PCR_WIDTH * PCR_N)
+#define PCR_POSES (4 * PCR_WIDTH * PCR_N)
+#define PCR_LOADS ((4 * PCR_WIDTH + 3) * PCR_N)
+#define PCR_LOAD_TANGENTS ((4 * PCR_WIDTH + 6) * PCR_N)
+#define PCR_RESULT (6 + 2 * PCR_N)  /* F, K, G */
+
+/* pcr_motors.c: rates nearest to u that keep all limits of the motors now and ever after. `reckoned` is another
+   opinion about the angles q, or NULL. */
+void pcr_kept(const pcr_controller *controller, const double *u, const double *previous, const double *q,
+              const double *reckoned, double *kept);
+void pcr_slowed(const pcr_controller *controller, const double *u, double *slowed);
+double pcr_clear_way(const pcr_parameters *parameters);
+int pcr_met(const pcr_controller *controller, const double *u, const double *previous);
+
+/* pcr_gate.c: what of a measurement is believed; the rest is as expected. */
+void pcr_gate_start(pcr_controller *controller, const double *q);
+pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measured, int *doubts);
+
+/* pcr_rods.c: follow the rods from `record` to another pose. `twice` and `once` are graphs that take two Newton
+   iterations or one. Returns 0 if they followed: `record` and `result` are then of that pose. */
+typedef int pcr_graph(const double **arg, double **res, long long *iw, double *w);
+typedef struct {
+    const double **arg;
+    double **res;
+    long long *iw;
+    double *w;
+} pcr_room;
+int pcr_climb(pcr_graph *first, pcr_graph *once, const double *numbers, const double *p, const double *q,
+              double derivatives, double *record, double *result, pcr_room room);
+int pcr_follow(pcr_graph *twice, pcr_graph *once, const double *numbers, const double *p, const double *q,
+               double derivatives, double *record, double *result, pcr_room room);
+
+/* pcr_pose.c: limits of the pose ahead that are near. Returns 0 if the rods could follow to it. */
+int pcr_near(pcr_controller *controller, pcr_pose_limits *limits);
+
+/* pcr_law.c: the plan of the linear MPC, from what `out` of the graph holds; the ladder below it. */
+void pcr_law_reset(pcr_controller *controller);
+void pcr_decide(pcr_controller *controller, const pcr_pose_limits *limits, pcr_output *output);
+void pcr_fall_back(pcr_controller *controller, const double *x, const double *wanted, const double *inputs,
+                   pcr_output *output);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,118 @@
+/* The plant: one time step as one graph, in one Newton iteration or two. */
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#include "pcr_graphs.h"
+#include "pcr_parts.h"
+
+#define ROUGH 1e-4
+
+pcr_result pcr_plant_init(pcr_plant *plant, const pcr_pose *pose)
+{
+    if (plant == NULL) {
+        return PCR_ARGUMENT;
+    }
+    memset(plant, 0, sizeof *plant);
+    const pcr_pose *at = pose == NULL ? &pcr_scene_pose : pose;
+    memcpy(plant->memory, pcr_scene_memory, sizeof plant->memory);
+    memcpy(plant->numbers, pcr_scene_plant_numbers, sizeof plant->numbers);
+    memcpy(plant->x, at->p, sizeof at->p);
+    memcpy(plant->x + 4, at->q, sizeof at->q);
+    if (pose != NULL) {
+        double record[PCR_RECORD], result[PCR_RESULT];
+        pcr_room room;
+        room.arg = plant->arg;
+        room.res = plant->res;
+        room.iw = plant->iw;
+        room.w = plant->w;
+        for (int i = 0; i < PCR_STATES; i++) {
+            if (!isfinite(plant->x[i])) {
+                return PCR_ARGUMENT;
+            }
+        }
+        memcpy(record, pcr_scene_record, sizeof record);
+        if (!PCR_PLANT_MASSLESS
+            || pcr_follow(pcr_graph_follow, pcr_graph_finish, plant->numbers, at->p, at->q, 1e-6, record, result,
+                          room)) {
+            return PCR_OUT_OF_REACH;
+        }
+        memcpy(plant->memory, record, PCR_LOADS * sizeof *record);
+        memcpy(plant->memory + PCR_LOADS, result, 2 * sizeof *result);
+    }
+    plant->started = 1;
+    return PCR_OK;
+}
+
+pcr_result pcr_plant_status(const pcr_plant *plant)
+{
+    return plant != NULL && plant->started ? PCR_OK : PCR_NOT_STARTED;
+}
+
+pcr_result pcr_plant_step(pcr_plant *plant, const double *u, const double *force)
+{
+    double given[PCR_N + 2], end[PCR_STATES], verdict[5];
+    if (pcr_plant_status(plant) != PCR_OK) {
+        return PCR_NOT_STARTED;
+    }
+    if (u == NULL) {
+        return PCR_ARGUMENT;
+    }
+    for (int i = 0; i < PCR_N + 2; i++) {
+        given[i] = i < PCR_N ? u[i] : force == NULL ? 0.0 : force[i - PCR_N];
+        if (!isfinite(given[i])) {
+            return PCR_ARGUMENT;
+        }
+    }
+    for (int corrections = 1; corrections <= 2; corrections++) {
+        plant->arg[0] = plant->memory;
+        plant->arg[1] = plant->x;
+        plant->arg[2] = given;
+        plant->arg[3] = plant->numbers;
+        plant->res[0] = plant->next;
+        plant->res[1] = end;
+        plant->res[2] = verdict;
+        (corrections == 1 ? pcr_graph_plant_once : pcr_graph_plant_twice)(plant->arg, plant->res, plant->iw, plant->w);
+        int good = 1;
+        for (int i = 0; i < 5; i++) {
+            good = good && verdict[i] <= pcr_plant_limits[i];
+        }
+        for (int i = 0; i < PCR_STATES; i++) {
+            good = good && isfinite(end[i]);
+        }
+        if (good) {
+            memcpy(plant->memory, plant->next, sizeof plant->memory);
+            memcpy(plant->x, end, sizeof end);
+            plant->corrections = corrections;
+            return PCR_OK;
+        }
+        if (!(verdict[0] <= ROUGH)) {
+            break; /* lost, not just unfinished */
+        }
+    }
+    return PCR_OUT_OF_REACH;
+}
+
+pcr_result pcr_plant_carry(pcr_plant *plant, double payload)
+{
+    if (pcr_plant_status(plant) != PCR_OK) {
+        return PCR_NOT_STARTED;
+    }
+    if (!(payload >= 0.0 && isfinite(payload)) || !PCR_PLANT_MASSLESS) {
+        return PCR_ARGUMENT;
+    }
+    double *mass = plant->numbers + PCR_TIP_MASS;
+    const double before = *mass;
+    *mass = pcr_scene_plant_numbers[PCR_TIP_MASS] + payload;
+    if (payload > plant->payload) {
+        plant->x[2] *= before / *mass;
+        plant->x[3] *= before / *mass;
+    }
+    plant->payload = payload;
+    return PCR_OK;
+}
+
+unsigned long pcr_plant_size(void)
+{
+    return sizeof(pcr_plant);
+}

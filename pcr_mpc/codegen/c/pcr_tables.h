@@ -1,0 +1,36 @@
+/* The scene's numbers, which were written beside this file. */
+#ifndef PCR_TABLES_H
+#define PCR_TABLES_H
+
+#include "pcr.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+extern const pcr_parameters pcr_scene_parameters;
+extern const pcr_pose pcr_scene_pose;
+extern const double pcr_scene_record[PCR_RECORD];         /* of the model's rods in that pose */
+extern const double pcr_scene_target_record[PCR_TARGET];  /* of the motor target's */
+extern const double pcr_scene_model[PCR_MODEL];           /* linear model of the robot at rest there */
+extern const double pcr_scene_mass[(2 + PCR_N) * (2 + PCR_N)];
+extern const double pcr_scene_memory[PCR_PLANT_MEMORY];   /* of the plant there */
+extern const double pcr_plant_limits[5];                  /* of a verdict with which the rods have followed */
+extern const int pcr_in_places[PCR_INS], pcr_out_places[PCR_OUTS]; /* where inputs and outputs of the graph lie */
+extern const double pcr_scene_plant_numbers[PCR_NUMBERS];
+extern const double pcr_scene_reference[PCR_REFERENCE_ROWS][PCR_ROW];
+extern const double pcr_scene_end[PCR_ROW];               /* held beyond the end of the reference */
+extern const double pcr_scene_payloads[PCR_PAYLOAD_ROWS];
+extern const double pcr_critical_rows[PCR_CRITICAL], pcr_critical_loads[PCR_CRITICAL];
+extern const double pcr_thickness[PCR_N];                  /* half thickness of each rod over its length */
+extern const int pcr_kind_rows[PCR_POSE_KINDS + 1];          /* rows of each kind of limits on poses */
+extern const int pcr_kind_bits[PCR_POSE_KINDS + 1];          /* which bit of pcr_output.active is its */
+extern const pcr_qp_shape pcr_rates_shape, pcr_limited_shapes[1 << PCR_POSE_KINDS];
+extern const int pcr_rates_starts[PCR_INPUTS + 1], pcr_rates_rows[PCR_RATES_A];
+extern const double pcr_rates_values[PCR_RATES_A];
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

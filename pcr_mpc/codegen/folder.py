@@ -1,0 +1,65 @@
+"""A folder that compiles by itself."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from ..files import require_free, results, write_text
+from ..loop.run import Run
+from .readme import readme
+from .solver import licence, sources
+from .subject import Subject
+from .tables import config, tables
+from .vectors import vectors
+
+_RUNTIME = Path(__file__).parent / "c"
+_OSQP = {"osqp/src": "src", "osqp/public": "inc/public", "osqp/private": "inc/private"}
+
+
+def require_free_folder(folder: Path, *, force: bool = False) -> None:
+    """Raise if a file of the folder is somebody's work.
+
+    Raises
+    ------
+    OutputError
+        Names the file, and what to do.
+    """
+    for path in (*_files(folder), *_copies(folder)):
+        require_free(path, force=force)
+
+
+def write_folder(subject: Subject, run: Run, folder: Path) -> None:
+    """Write all of it; ``run`` is the scene as Python runs it."""
+    writers: tuple[Callable[[], str], ...] = (
+        lambda: config(subject),
+        lambda: tables(subject),
+        lambda: subject.graphs.source,
+        lambda: vectors(subject, run),
+        lambda: readme(subject, run),
+        licence,
+    )
+    texts = dict(zip(_files(folder), writers, strict=True))
+    copies = _copies(folder)
+    for place in dict.fromkeys(path.parent for path in (*texts, *copies)):
+        with results(place) as staged:
+            for path, write in texts.items():
+                if path.parent == place:
+                    write_text(staged / path.name, write())
+            for path, source in copies.items():
+                if path.parent == place:
+                    shutil.copyfile(source, staged / path.name)
+
+
+def _files(folder: Path) -> list[Path]:
+    names = ["pcr_config.h", "pcr_tables.c", "pcr_graphs.c", "pcr_vectors.c", "README.md", "osqp/LICENSE"]
+    return [folder / name for name in names]
+
+
+def _copies(folder: Path) -> dict[Path, Path]:
+    """Files that are copied as they are, and where from."""
+    found = {folder / path.name: path for path in sorted(_RUNTIME.iterdir()) if path.name != "readme.md"}
+    for place, inside in _OSQP.items():
+        found |= {folder / place / path.name: path for path in sorted((sources() / inside).glob("*.[ch]"))}
+    return found

@@ -1,0 +1,103 @@
+"""The graphs of plant and controller as one C file, rods and models as calls, and what working memory they need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from ..buffered import building
+from ..control.condensing import checking
+from ..control.mpc import LinearMPC
+from ..linearisation.model_graph import force_graph
+from ..loop.foresight_graph import Places, foresight_graph
+from ..plant.motion.plant import Plant
+from ..plant.motion.step_graph import StepModel, step_graph
+from ..plant.rods import elastica
+from ..plant.rods.method import warm_calls
+
+# Kept to one translation unit, where what nobody calls falls away.
+_HEAD = """/* Written by CasADi from the graphs of pcr_mpc; the functions at the end are what pcr_graphs.h declares. */
+#define CASADI_SYMBOL_EXPORT static
+"""
+
+
+@dataclass(frozen=True)
+class Graphs:
+    """All functions by the names that ``pcr_graphs.h`` gives them.
+
+    Attributes
+    ----------
+    functions : dict of str to casadi.Function
+    source : str
+        C of all of them.
+    """
+
+    functions: dict[str, Any]
+    source: str
+
+    def room(self, *names: str) -> dict[str, int]:
+        """Largest sizes of arg, res, iw and w of some of them, or of all but those."""
+        found = [self.functions[name] for name in names]
+        return {part: max(1, *(getattr(f, f"sz_{part}")() for f in found)) for part in ("arg", "res", "iw", "w")}
+
+
+@building
+def make_graphs(model: StepModel, target: StepModel, places: Places, law: LinearMPC, plant: Plant) -> Graphs:
+    """Put together the C of a controller's graphs and of a plant's.
+
+    Parameters
+    ----------
+    model, target : StepModel
+        Of the controller's model, and of the rods that carry the observed force.
+    places : Places
+        Of the controller.
+    law : LinearMPC
+    plant : Plant
+    """
+    n = model.kind.n_rods
+    assert plant.step_model is not None
+    condense = law.condensing(n, places.models)
+    steps = [step_graph(plant.step_model, count, details=False, inline=False) for count in (1, 2)]
+    functions = {
+        "foresight": _called(foresight_graph(model, target, places, condense, inline=False), "look_ahead"),
+        "check": _called(checking(places.horizon, n, places.models), "look_back"),
+        "follow": _rods(model, 2, "follow"),
+        "finish": _rods(model, 1, "finish"),
+        "target_follow": _rods(target, 2, "target_follow"),
+        "target_finish": _rods(target, 1, "target_finish"),
+        "plant_once": _called(steps[0], "plant_once"),
+        "plant_twice": _called(steps[1], "plant_twice"),
+        "tip_map": _called(elastica.tip_map(), "tip_map"),
+        "curvature": _called(elastica.rod_curvature(), "curvature"),
+    }
+    generator = ca.CodeGenerator("pcr_graphs.c")
+    for function in functions.values():
+        generator.add(function)
+    ends = [_entry(name, function.name()) for name, function in functions.items()]
+    return Graphs(functions, _HEAD + '#include "pcr_graphs.h"\n' + generator.dump() + "\n" + "\n".join(ends))
+
+
+def _entry(name: str, function: str) -> str:
+    arguments = "const double **arg, double **res, long long *iw, double *w"
+    return f"int pcr_graph_{name}({arguments}) {{ return {function}(arg, res, iw, w, 0); }}\n"
+
+
+def _rods(model: StepModel, iterations: int, name: str) -> Any:
+    """`warm_calls` of the rods of a plant, whose result is all that weighs on it."""
+    kind = model.kind
+    target, vector = ca.MX.sym("target", 2 + kind.n_rods), ca.MX.sym("numbers", kind.size)
+    memory = ca.MX.sym("memory", model.widths[0])
+    if model.weight == "none":
+        results = warm_calls(kind, model.method, iterations)(target, memory, kind.weightless(vector))
+        return ca.Function(name, [target, memory, vector], list(results))
+    record, verdict, force, k, g = force_graph(model, iterations)(target, memory, vector)
+    return ca.Function(name, [target, memory, vector], [record, verdict, ca.vertcat(force, ca.vec(k), ca.vec(g))])
+
+
+def _called(function: Any, name: str) -> Any:
+    """The function under another name, its results dense."""
+    symbols = [ca.MX.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
+    results = [ca.densify(result) for result in function.call(symbols)]
+    return ca.Function(name, symbols, results, function.name_in(), function.name_out())

@@ -1,0 +1,44 @@
+"""What a generated folder says of itself."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+from ..loop.run import Run
+from .subject import Subject
+
+_TEXT = Path(__file__).parent / "c" / "readme.md"
+
+
+def readme(subject: Subject, run: Run) -> str:
+    """Text of ``README.md``: the API, and the figures of this scene."""
+    scene, tuning, summary = subject.scene, subject.tuning, run.summary()
+    kind = subject.work.foresight.step_models[0].kind
+    watched = ", ".join(subject.kinds) or "none"
+    worst = tuning.max_iterations
+    n, m, _, of_a, _ = subject.limited[-1].sizes
+    units = "\n".join(f"| {i} | `{name}` | {unit} |" for i, (name, unit) in enumerate(kind.units.items()))
+    values = {
+        "scene": scene.name,
+        "tuning": tuning.name,
+        "rms": f"{summary['rms_mm']:.12f}",
+        "largest": f"{summary['max_mm']:.6g}",
+        "periods": str(scene.n_periods),
+        "period": f"{scene.period:g}",
+        "plant_step": f"{subject.plant.dt:g}",
+        "horizon": str(tuning.horizon),
+        "row": str(6 + 2 * subject.robot.n_rods),
+        "delay": str(subject.work.delay),
+        "watched": watched,
+        "iterations": f"p50 {summary['qp_iterations']['p50']:g}, max {summary['qp_iterations']['max']:g}",
+        "worst": str(worst),
+        "worst_flops": f"{worst * 4 * (subject.limited[-1].factor + of_a + n + m):.2g}",
+        "numbers": units,
+        "versions": f"casadi {version('casadi')}, osqp {version('osqp')}, Python {platform.python_version()}",
+    }
+    text = _TEXT.read_text(encoding="utf-8")
+    for name, value in values.items():
+        text = text.replace("{{" + name + "}}", value)
+    return text

@@ -1,0 +1,213 @@
+"""The two generated files that are about the scene's numbers: ``pcr_config.h`` and ``pcr_tables.c``."""
+
+from __future__ import annotations
+
+import math
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+
+from ..control.limited_qp import PENALTY
+from ..control.qp import stage_weights
+from ..linearisation.model_graph import sizes
+from ..loop.parts import tip_noise
+from ..plant.motion.step_graph import limits as step_limits
+from ..plant.rods.chart import critical_load_table
+from .ctext import array, block, defines, number, structure
+from .solver import Shape
+from .subject import KIND_BITS, Subject
+
+_LOG_TAUT = -15.0  # see strain.quarter_period
+
+
+def _offsets(prefix: str, names: list[str], lengths: list[int]) -> dict[str, Any]:
+    """Where each input or output of a graph begins in the memory of all of them."""
+    starts = [0, *accumulate(lengths)]
+    found = {f"{prefix}_{name.upper()}": start for name, start in zip(names, starts, strict=False)}
+    return found | {f"{prefix}_SIZE": starts[-1]}
+
+
+def _inputs(function: Any) -> tuple[list[str], list[int]]:
+    return list(function.name_in()), [function.numel_in(i) for i in range(function.n_in())]
+
+
+def _outputs(function: Any) -> tuple[list[str], list[int]]:
+    return list(function.name_out()), [function.numel_out(i) for i in range(function.n_out())]
+
+
+def config(subject: Subject) -> str:
+    """Text of ``pcr_config.h``."""
+    scene, tuning, work, graphs = subject.scene, subject.tuning, subject.work, subject.graphs
+    n, horizon, places = subject.robot.n_rods, tuning.horizon, work.foresight.places
+    model, target = work.foresight.step_models
+    foresight, check = graphs.functions["foresight"], graphs.functions["check"]
+    reference, _, payloads = subject.reference()
+    rooms = graphs.room(*(name for name in graphs.functions if not name.startswith("plant")))
+    plant_rooms = graphs.room("plant_once", "plant_twice", "follow", "finish")
+    kinds = subject.kinds
+    largest = subject.limited[-1]
+    columns, rows, _, of_a, _ = largest.sizes
+    observer = work.observer
+    values: dict[str, Any] = {
+        "PCR_N": n,
+        "PCR_STATES": 4 + n,
+        "PCR_HORIZON": horizon,
+        "PCR_INPUTS": horizon * n,
+        "PCR_TRIANGLE": horizon * n * (horizon * n + 1) // 2,
+        "PCR_DELAY": places.delay,
+        "PCR_MODELS": places.models,
+        "PCR_PLACES": places.count,
+        "PCR_ROW": 6 + 2 * n,
+        "PCR_MODEL": sizes(model).model,
+        "PCR_RECORD": sizes(model).record,
+        "PCR_TARGET": sizes(target).record,
+        "PCR_NUMBERS": model.kind.size,
+        "PCR_ROD_NUMBERS": model.kind.names.index("rods[1].bending_stiffness"),
+        "PCR_TIP_MASS": model.kind.names.index("tip_mass"),
+        "PCR_PERIOD": float(scene.period),
+        "PCR_PERIODS": scene.n_periods,
+        "PCR_PLANT_STEP": float(subject.plant.dt),
+        "PCR_STEPS_A_PERIOD": round(scene.period / subject.plant.dt),
+        "PCR_REAL_DELAY": scene.delay,
+        "PCR_REFERENCE_ROWS": len(reference),
+        "PCR_PAYLOAD_ROWS": len(payloads),
+        "PCR_TOLERANCE": float(tuning.tolerance),
+        "PCR_MAX_ITERATIONS": tuning.max_iterations,
+        "PCR_PENALTY": PENALTY,
+        "PCR_OBSERVER": int(observer is not None),
+        "PCR_TIP_NOISE": tip_noise(scene, tuning),
+        "PCR_ANGLE_STEP": float(scene.angle_step),
+        "PCR_WRAPPED": int(scene.wrapped),
+        "PCR_LOG_TAUT": _LOG_TAUT,
+        "PCR_CRITICAL": len(critical_load_table()[0]),
+        "PCR_WATCHES_TORQUE": int("torque" in kinds),
+        "PCR_WATCHES_TIP": int("tip region" in kinds),
+        "PCR_WATCHES_MARGIN": int("rod margin" in kinds),
+        "PCR_WATCHES_STIFFNESS": int("stiffness" in kinds),
+        "PCR_WATCHES_STRAIN": int("strain" in kinds),
+        "PCR_POSE_KINDS": len(kinds),
+        "PCR_POSE_ROWS": sum(kinds.values()),
+        "PCR_LIMITED_N": columns,
+        "PCR_LIMITED_M": rows,
+        "PCR_LIMITED_A": of_a,
+        "PCR_LIMITED_ROWS": rows - (columns - horizon * n),
+        "PCR_LIMITED_DOUBLES": max(shape.doubles for shape in subject.limited),
+        "PCR_LIMITED_INTS": max(shape.ints for shape in subject.limited),
+        "PCR_RATES_A": subject.rates.matrix.nnz,
+        "PCR_RATES_DOUBLES": subject.rates.doubles,
+        "PCR_RATES_INTS": subject.rates.ints,
+        "PCR_PLANT_MEMORY": sum(subject.plant.step_model.widths) if subject.plant.step_model else 0,
+        "PCR_PLANT_MASSLESS": int(subject.plant.inertia == "none" and subject.plant.weight == "none"),
+    }
+    values |= {f"PCR_{part.upper()}": size for part, size in rooms.items()}
+    values |= {f"PCR_PLANT_{part.upper()}": size for part, size in plant_rooms.items()}
+    values |= _offsets("PCR_IN", *_inputs(foresight)) | {"PCR_INS": foresight.n_in()}
+    outs = _offsets("PCR_OUT", *_outputs(foresight))
+    values |= outs | {"PCR_OUTS": foresight.n_out()}
+    # What the next period starts from; see `Foresight`.
+    after = outs["PCR_OUT_FOLLOWED"] + sizes(model).record
+    values |= {"PCR_OUT_NEXT": after, "PCR_NEXT": outs["PCR_OUT_NOW"] - after,
+               "PCR_OUT_RECKONED": outs["PCR_OUT_MOVED_RECKONED"]}  # fmt: skip
+    names = ["models", "x", "p", "q", "l", "u", "bounds", "dt", "clear", "inputs", "y"]
+    values |= _offsets("PCR_CHECK", names, _inputs(check)[1])
+    values["PCR_CHECK_IN_SIZE"] = values.pop("PCR_CHECK_SIZE")
+    values["PCR_CHECK_OUT_SIZE"] = sum(_outputs(check)[1])
+    return (
+        f"/* Sizes and settings of the controller {tuning.name!r} of the scene {scene.name!r}. */\n"
+        f"#ifndef PCR_CONFIG_H\n#define PCR_CONFIG_H\n\n{defines(values)}\n#endif\n"
+    )
+
+
+def parameters(subject: Subject) -> dict[str, np.ndarray | float]:
+    """Members of ``pcr_parameters`` in their order."""
+    n, work, limits = subject.robot.n_rods, subject.work, subject.limits
+    motors, given = work.limits, work.foresight.inputs
+    model, gain = subject.resting()
+    none = math.inf
+    return {
+        "numbers": given["numbers"],
+        "weights": np.array(stage_weights(subject.tuning)),
+        "terminal": subject.law.terminal.ravel(order="F"),
+        "gain": gain.ravel(),
+        "observer_gain": given["gain"].ravel(order="F"),
+        "rate": motors.rate,
+        "rate_change": motors.rate_change,
+        "angle_lower": motors.angle_lower,
+        "angle_upper": motors.angle_upper,
+        "reach": model.reach,
+        "torque": none if limits.torque is None else limits.torque,
+        "tip_lower": np.array(limits.tip_lower or (-none, -none)),
+        "tip_upper": np.array(limits.tip_upper or (none, none)),
+        "rod_margin": -none if limits.rod_margin is None else limits.rod_margin,
+        "stiffness": -none if limits.stiffness is None else limits.stiffness,
+        "strain": limits.strains(subject.robot) if "strain" in subject.kinds else np.full(n, none),
+    }
+
+
+def tables(subject: Subject) -> str:
+    """Text of ``pcr_tables.c``."""
+    work, pose, graphs = subject.work, subject.pose, subject.graphs
+    foresight, given = graphs.functions["foresight"], work.foresight.inputs
+    reference, end, payloads = subject.reference()
+    model, _ = subject.resting()
+    column = np.concatenate([model.A.ravel("F"), model.c, model.B.ravel("F"), model.E.ravel("F")])
+    plant, robot = subject.plant, subject.robot
+    x = np.concatenate([pose.p, [0.0, 0.0], pose.q])
+    assert plant.step_model is not None
+    record = work.foresight.rows["records"][0]
+    rows, loads = critical_load_table()
+    ratios = np.array([rod.thickness_ratio or math.nan for rod in robot.rods])
+    kinds = list(subject.kinds)
+    texts = [
+        f"/* Numbers of the scene {subject.scene.name!r} and of its controller {subject.tuning.name!r}. */\n"
+        '#include "pcr_tables.h"\n\n#include <math.h>\n#include <stddef.h>\n',
+        structure("pcr_parameters", "pcr_scene_parameters",
+                  [number(v) if isinstance(v, float) else block(v) for v in parameters(subject).values()]),
+        structure("pcr_pose", "pcr_scene_pose", [block(pose.p), block(pose.q)]),
+        array("double", "pcr_scene_record", record),
+        array("double", "pcr_scene_target_record", given["target"]),
+        array("double", "pcr_scene_model", column),
+        array("double", "pcr_scene_mass", given["mass"].ravel(order="F")),
+        array("double", "pcr_scene_memory", plant.memory(x)),
+        array("double", "pcr_scene_plant_numbers", plant.numbers),
+        array("double", "pcr_plant_limits", np.array(step_limits(plant.step_model))),
+        array("int", "pcr_in_places", np.array([0, *np.cumsum(_inputs(foresight)[1])[:-1]])),
+        array("int", "pcr_out_places", np.array([0, *np.cumsum(_outputs(foresight)[1])[:-1]])),
+        array("double", "pcr_scene_reference", reference),
+        array("double", "pcr_scene_end", end),
+        array("double", "pcr_scene_payloads", payloads),
+        array("double", "pcr_critical_rows", rows),
+        array("double", "pcr_critical_loads", loads),
+        array("double", "pcr_thickness", ratios),
+        array("int", "pcr_kind_rows", np.array([*subject.kinds.values(), 0])),
+        array("int", "pcr_kind_bits", np.array([*(KIND_BITS[kind] for kind in kinds), 0])),
+        *_shapes(subject),
+    ]  # fmt: skip
+    return "\n".join(texts)
+
+
+def _shapes(subject: Subject) -> list[str]:
+    orders: dict[int, str] = {}
+    texts = []
+    for shape in (subject.rates, *subject.limited):
+        if id(shape) not in orders:
+            orders[id(shape)] = f"order_{len(orders)}"
+            texts.append("static " + array("unsigned short", orders[id(shape)], shape.order))
+    matrix = subject.rates.matrix
+    return [
+        *texts,
+        f"const pcr_qp_shape pcr_rates_shape = {_shape(subject.rates, orders)};\n",
+        f"const pcr_qp_shape pcr_limited_shapes[{len(subject.limited)}] = {{\n"
+        + ",\n".join(_shape(shape, orders) for shape in subject.limited)
+        + "\n};\n",
+        array("int", "pcr_rates_starts", matrix.indptr),
+        array("int", "pcr_rates_rows", matrix.indices),
+        array("double", "pcr_rates_values", matrix.data),
+    ]
+
+
+def _shape(shape: Shape, orders: dict[int, str]) -> str:
+    n, m, of_p, of_a, of_k = shape.sizes
+    numbers = [n, m, int(shape.identity), of_p, of_a, of_k, shape.factor]
+    return "{" + ", ".join(map(str, numbers)) + f", {orders[id(shape)]}}}"

@@ -1,0 +1,141 @@
+"""C of plant and controller against Python: the same rates, rungs and iterations, by compilers that forgive nothing."""
+
+import os
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from pcr_mpc.cli import main
+from pcr_mpc.codegen.scope import check_scope
+from pcr_mpc.errors import GenerationError
+from pcr_mpc.loop.scene import load_scene
+
+from .conftest import ROOT
+
+SCENES = ROOT / "models" / "scenes"
+CC = os.environ.get("CC") or "gcc"
+needs_compiler = pytest.mark.skipif(
+    not (shutil.which(CC) and shutil.which("make")), reason="generated C is compiled here: needs gcc and make"
+)
+# Quick to build; no optimisation may change a bit of what it computes.
+QUICK = ["CFLAGS=-O0", "GRAPH_CFLAGS=-O0"]
+
+
+def generated(scene, folder):
+    assert main(["generate", str(SCENES / f"{scene}.toml"), "--out", str(folder)]) == 0
+    return folder
+
+
+def make(folder, *words):
+    done = subprocess.run(["make", "-s", "-C", str(folder), f"CC={CC}", *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "warning" not in done.stderr, done.stderr
+    return folder
+
+
+def run(folder, *words, **more):
+    """Standard output of the example, whose exit status says whether all is as recorded."""
+    done = subprocess.run([str(folder / "example"), *words], capture_output=True, text=True, **more)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="session")
+def lemniscate(tmp_path_factory):
+    return generated("lemniscate", tmp_path_factory.mktemp("c") / "lemniscate")
+
+
+def copied(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("*.o", "*.a", "example"))
+
+
+@needs_compiler
+def test_the_lemniscate_runs_in_c_as_it_does_in_python(lemniscate):
+    said = run(make(lemniscate, *QUICK))
+    rms, other = (float(word) for word in re.findall(r"([\d.]+) mm", said)[:2])
+    assert abs(rms - other) <= 1e-9
+    assert 0.001 < rms < 0.003  # what the README says of the scene
+    differences = [float(word) for word in re.findall(r"at most ([\d.e+-]+) rad/s", said)]
+    assert len(differences) == 2
+    assert max(differences) <= 1e-9
+    assert said.count("rung or iterations in 0 of 600 periods") == 2
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["sensors", "limited"])
+def test_a_scene_runs_in_c_as_it_does_in_python(scene, tmp_path):
+    said = run(make(generated(scene, tmp_path / scene), *QUICK))
+    assert said.count("rung or iterations in 0 of ") == 2
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_sanitisers_find_nothing(lemniscate, tmp_path):
+    folder = copied(lemniscate, tmp_path)
+    # Undefined behaviour in what CasADi and OSQP wrote counts too.
+    checked = "-O0 -fsanitize=address,undefined -fno-sanitize-recover=all"
+    make(folder, f"CFLAGS={checked}", "GRAPH_CFLAGS=-O0 -fsanitize=address,undefined -fno-sanitize-recover=all")
+    run(folder)
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_no_compiler_warns_of_the_runtime(compiler, lemniscate):
+    if not shutil.which(compiler):
+        pytest.skip(f"there is no {compiler} here")
+    own = sorted(path.name for path in (ROOT / "pcr_mpc" / "codegen" / "c").glob("*.c"))
+    assert len(own) > 8
+    words = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-fsyntax-only", "-I."]
+    words += ["-isystem", "osqp/public", "-isystem", "osqp/private"]
+    done = subprocess.run([compiler, *words, *own, "pcr_tables.c"], cwd=lemniscate, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_cpp_may_include_the_header(lemniscate, tmp_path):
+    if not shutil.which("g++"):
+        pytest.skip("there is no g++ here")
+    program = tmp_path / "main.cpp"
+    program.write_text('#include "pcr.h"\nint main() { static pcr_plant p; return pcr_plant_init(&p, nullptr); }\n')
+    words = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-I."]
+    words += ["-isystem", "osqp/public", "-isystem", "osqp/private"]
+    done = subprocess.run(["g++", *words, str(program)], cwd=lemniscate, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_nothing_of_the_library_allocates_or_prints(lemniscate, tmp_path):
+    folder = copied(lemniscate, tmp_path)
+    make(folder, *QUICK, "libpcr.a")
+    listed = subprocess.run(["nm", "-u", str(folder / "libpcr.a")], capture_output=True, text=True, check=True).stdout
+    needed = {line.split()[-1] for line in listed.splitlines() if " U " in f" {line}"}
+    assert "sqrt" in needed  # it lists what it should
+    banned = re.compile(r"alloc|^free$|print|put[sc]|^f?write$|errno|locale|^exit$|^abort$")
+    assert not [name for name in needed if banned.search(name)]
+    held = subprocess.run(["nm", str(folder / "libpcr.a")], capture_output=True, text=True, check=True).stdout
+    variables = [line.split() for line in held.splitlines() if re.search(r" [bBC] ", line)]
+    assert not variables  # state is in the structures alone
+
+
+@pytest.mark.parametrize(
+    ("scene", "part"),
+    [("curved_rods", "method of the controller's rods"), ("release", "reference")],
+)
+def test_what_c_does_not_have_is_said_by_name(scene, part):
+    loaded = load_scene(SCENES / f"{scene}.toml")
+    with pytest.raises(GenerationError, match=r"C has no|nothing to track") as error:
+        check_scope(loaded, loaded.tuning)
+    assert error.value.part == part
+
+
+def test_files_of_others_are_left_alone(tmp_path, capsys):
+    (tmp_path / "README.md").write_text("mine")
+    assert main(["generate", str(SCENES / "lemniscate.toml"), "--out", str(tmp_path)]) == 1
+    assert "README.md" in capsys.readouterr().err
+    assert (tmp_path / "README.md").read_text() == "mine"
