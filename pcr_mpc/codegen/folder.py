@@ -30,17 +30,25 @@ def require_free_folder(folder: Path, *, force: bool = False) -> None:
         require_free(path, force=force)
 
 
-def write_folder(subject: Subject, run: Run, folder: Path) -> None:
-    """Write all of it; ``run`` is the scene as Python runs it."""
-    writers: tuple[Callable[[], str], ...] = (
+def write_folder(subject: Subject, run: Run | None, folder: Path) -> None:
+    """Write all of it.
+
+    Parameters
+    ----------
+    subject : Subject
+    run : Run or None
+        The scene as Python runs it. None: what compiles to the library is enough.
+    folder : Path
+    """
+    writers: list[Callable[[], str]] = [
         lambda: config(subject),
         lambda: tables(subject),
         lambda: subject.graphs.source,
-        lambda: vectors(subject, run),
-        lambda: readme(subject, run),
         licence,
-    )
-    texts = dict(zip(_files(folder), writers, strict=True))
+    ]
+    if run is not None:
+        writers += [lambda: vectors(subject, run), lambda: readme(subject, run)]
+    texts = dict(zip(_files(folder), writers, strict=False))
     copies = _copies(folder)
     for place in dict.fromkeys(path.parent for path in (*texts, *copies)):
         with results(place) as staged:
@@ -53,7 +61,7 @@ def write_folder(subject: Subject, run: Run, folder: Path) -> None:
 
 
 def _files(folder: Path) -> list[Path]:
-    names = ["pcr_config.h", "pcr_tables.c", "pcr_graphs.c", "pcr_vectors.c", "README.md", "osqp/LICENSE"]
+    names = ["pcr_config.h", "pcr_tables.c", "pcr_graphs.c", "osqp/LICENSE", "pcr_vectors.c", "README.md"]
     return [folder / name for name in names]
 
 

@@ -58,7 +58,7 @@ def make_graphs(model: StepModel, target: StepModel, places: Places, law: Linear
     """
     n = model.kind.n_rods
     assert plant.step_model is not None
-    condense = law.condensing(n, places.models)
+    condense = law.condensing(n, places.models, inline=False)
     steps = [step_graph(plant.step_model, count, details=False, inline=False) for count in (1, 2)]
     functions = {
         "foresight": _called(foresight_graph(model, target, places, condense, inline=False), "look_ahead"),
@@ -69,8 +69,8 @@ def make_graphs(model: StepModel, target: StepModel, places: Places, law: Linear
         "target_finish": _rods(target, 1, "target_finish"),
         "plant_once": _called(steps[0], "plant_once"),
         "plant_twice": _called(steps[1], "plant_twice"),
-        "tip_map": _called(elastica.tip_map(), "tip_map"),
-        "curvature": _called(elastica.rod_curvature(), "curvature"),
+        "determinant": _called(elastica.tip_determinant(), "determinant"),
+        "curvature": _called(elastica.rod_curvature(inline=False), "curvature"),
     }
     generator = ca.CodeGenerator("pcr_graphs.c")
     for function in functions.values():

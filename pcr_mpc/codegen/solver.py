@@ -59,7 +59,7 @@ class Shape:
     def ints(self) -> int:
         """Memory that ``pcr_qp_setup`` takes [ints]."""
         n, m, of_p, of_a, of_k = self.sizes
-        patterns = 2 * (n + 1 + n + m + 1) + of_p + of_a + of_k + self.factor
+        patterns = (n + 1) + 2 * (n + m + 1) + of_p + of_k + self.factor
         return patterns + 9 * (n + m) + of_p + 3 * of_a + 3 * m + 1
 
 

@@ -94,6 +94,7 @@ def config(subject: Subject) -> str:
         "PCR_LIMITED_ROWS": rows - (columns - horizon * n),
         "PCR_LIMITED_DOUBLES": max(shape.doubles for shape in subject.limited),
         "PCR_LIMITED_INTS": max(shape.ints for shape in subject.limited),
+        "PCR_LIMITED_LAST": _places(subject)[-1],
         "PCR_RATES_A": subject.rates.matrix.nnz,
         "PCR_RATES_DOUBLES": subject.rates.doubles,
         "PCR_RATES_INTS": subject.rates.ints,
@@ -201,10 +202,16 @@ def _shapes(subject: Subject) -> list[str]:
         f"const pcr_qp_shape pcr_limited_shapes[{len(subject.limited)}] = {{\n"
         + ",\n".join(_shape(shape, orders) for shape in subject.limited)
         + "\n};\n",
+        array("int", "pcr_limited_places", np.array(_places(subject)[:-1])),
         array("int", "pcr_rates_starts", matrix.indptr),
         array("int", "pcr_rates_rows", matrix.indices),
         array("double", "pcr_rates_values", matrix.data),
     ]
+
+
+def _places(subject: Subject) -> list[int]:
+    """Where the last solution of each combination of kinds is kept, and the end of all of them."""
+    return [0, *accumulate(sum(shape.sizes[:2]) for shape in subject.limited)]
 
 
 def _shape(shape: Shape, orders: dict[int, str]) -> str:

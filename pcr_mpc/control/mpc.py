@@ -88,10 +88,11 @@ class LinearMPC:
             for kinds in ((), *combinations):
                 self._workspace.limited(kinds)
 
-    def condensing(self, n: int, models: int) -> Any:
+    def condensing(self, n: int, models: int, *, inline: bool = True) -> Any:
         """Graph that assembles the QP for n motors from 1 or N models (see `condensing`)."""
         tuning = self.tuning
-        return condensing(tuning.horizon, n, models, velocity=tuning.velocity_weight > 0, angle=tuning.angle_weight > 0)
+        weighed = {"velocity": tuning.velocity_weight > 0, "angle": tuning.angle_weight > 0}
+        return condensing(tuning.horizon, n, models, **weighed, inline=inline)
 
     @property
     def terminal(self) -> np.ndarray:

@@ -14,7 +14,7 @@ int pcr_graph_target_follow(const double **arg, double **res, long long *iw, dou
 int pcr_graph_target_finish(const double **arg, double **res, long long *iw, double *w);
 int pcr_graph_plant_once(const double **arg, double **res, long long *iw, double *w);
 int pcr_graph_plant_twice(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_tip_map(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_determinant(const double **arg, double **res, long long *iw, double *w);
 int pcr_graph_curvature(const double **arg, double **res, long long *iw, double *w);
 
 #ifdef __cplusplus

@@ -46,13 +46,14 @@ static void put_away(pcr_limited *limited)
     if (limited->kinds < 0) {
         return;
     }
-    const OSQPWorkspace *work = &limited->qp.work;
+    const pcr_qp *qp = &limited->qp;
     pcr_limited_state *state = &limited->kept[limited->kinds];
+    const int n = qp->shape->n, m = qp->shape->m;
+    double *last = limited->last + pcr_limited_places[limited->kinds];
     state->used = 1;
-    state->rho = limited->qp.settings.rho;
-    memcpy(state->x, work->x->values, (size_t)work->x->length * sizeof *state->x);
-    memcpy(state->z, work->z->values, (size_t)work->z->length * sizeof *state->z);
-    memcpy(state->y, work->y->values, (size_t)work->y->length * sizeof *state->y);
+    state->rho = qp->settings.rho;
+    memcpy(last, qp->solution.x, (size_t)n * sizeof *last);
+    memcpy(last + n, qp->solution.y, (size_t)m * sizeof *last);
 }
 
 /* Let the solver of these kinds go on from where it was. */
@@ -69,29 +70,25 @@ static int fetch(pcr_limited *limited, int kinds)
         limited->starts[j] = e;
         for (int i = 0; i < rows; i++, e++) {
             limited->rows[e] = i;
-            limited->values[e] = 1.0;
         }
     }
     for (int j = 0; j < 2 * soft; j++) {
         limited->starts[size + j] = e;
-        limited->rows[e] = 2 * size + j % soft;
-        limited->values[e++] = j < soft ? 1.0 : -1.0;
-        limited->rows[e] = rows + j;
-        limited->values[e++] = 1.0;
+        limited->rows[e++] = 2 * size + j % soft;
+        limited->rows[e++] = rows + j;
     }
     limited->starts[size + 2 * soft] = e;
     pcr_qp *qp = &limited->qp;
-    if (pcr_qp_setup(qp, &pcr_limited_shapes[kinds], &settings, limited->starts, limited->rows, limited->values,
+    if (pcr_qp_setup(qp, &pcr_limited_shapes[kinds], &settings, limited->starts, limited->rows, NULL,
                      limited->doubles, limited->ints)) {
         return PCR_LEFT_NOT_CONVEX;
     }
     const pcr_limited_state *state = &limited->kept[kinds];
     if (state->used) {
-        memcpy(qp->work.x->values, state->x, (size_t)qp->work.x->length * sizeof *state->x);
-        memcpy(qp->work.z->values, state->z, (size_t)qp->work.z->length * sizeof *state->z);
-        memcpy(qp->work.y->values, state->y, (size_t)qp->work.y->length * sizeof *state->y);
-        memcpy(qp->solution.x, state->x, (size_t)qp->work.x->length * sizeof *state->x);
-        memcpy(qp->solution.y, state->y, (size_t)qp->work.y->length * sizeof *state->y);
+        /* The iterates need not be kept: every solution starts from the last one, or, after a failure, from zero. */
+        const double *last = limited->last + pcr_limited_places[kinds];
+        memcpy(qp->solution.x, last, (size_t)qp->shape->n * sizeof *last);
+        memcpy(qp->solution.y, last + qp->shape->n, (size_t)qp->shape->m * sizeof *last);
         osqp_update_rho(&qp->solver, state->rho);
     }
     limited->kinds = kinds;
@@ -330,15 +327,16 @@ void pcr_limited_solve(pcr_limited *limited, const double *p, const double *q, c
         answer->left = PCR_LEFT_CROSSED;
         return;
     }
+    pcr_qp *qp = &limited->qp;
+    double *entries = qp->a_csc.x; /* where they belong; OSQP copies them onto themselves */
     for (int j = 0; j < size; j++) {
-        memcpy(limited->values + j * rows, a[j], (size_t)rows * sizeof *a[j]);
+        memcpy(entries + j * rows, a[j], (size_t)rows * sizeof *a[j]);
     }
     for (int j = 0, e = size * rows; j < 2 * soft; j++) {
-        limited->values[e++] = j < soft ? 1.0 : -1.0;
-        limited->values[e++] = 1.0;
+        entries[e++] = j < soft ? 1.0 : -1.0;
+        entries[e++] = 1.0;
     }
-    pcr_qp *qp = &limited->qp;
-    answer->left = pcr_qp_update(qp, NULL, limited->values, limited->q, limited->l, limited->u);
+    answer->left = pcr_qp_update(qp, NULL, entries, limited->q, limited->l, limited->u);
     if (answer->left) {
         pcr_limited_reset(limited, limited->penalty);
         return;

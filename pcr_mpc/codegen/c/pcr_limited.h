@@ -19,11 +19,11 @@ typedef struct {
     double scale[PCR_POSE_ROWS + 1];          /* what one unit of a row is */
 } pcr_pose_limits;
 
-/* What is kept of the solver of one combination of kinds while another one is at work. */
+/* What is kept of the solver of one combination of kinds while another one is at work; its last slacks and multipliers
+   are in pcr_limited.last. */
 typedef struct {
     int used, solved;
     double rho;
-    double x[PCR_LIMITED_N], z[PCR_LIMITED_M], y[PCR_LIMITED_M];
 } pcr_limited_state;
 
 typedef struct {
@@ -33,12 +33,12 @@ typedef struct {
     double doubles[PCR_LIMITED_DOUBLES];
     int ints[PCR_LIMITED_INTS];
     int starts[PCR_LIMITED_N + 1], rows[PCR_LIMITED_A];
-    double values[PCR_LIMITED_A];
     double factor[PCR_INPUTS][PCR_INPUTS];    /* L, lower triangular, with P = L L' */
     double stacked[PCR_INPUTS][PCR_LIMITED_ROWS];
     double length[PCR_LIMITED_ROWS];
-    double q[PCR_LIMITED_N], l[PCR_LIMITED_M], u[PCR_LIMITED_M], x[PCR_LIMITED_N], y[PCR_LIMITED_M];
+    double q[PCR_LIMITED_N], l[PCR_LIMITED_M], u[PCR_LIMITED_M];
     pcr_limited_state kept[1 << PCR_POSE_KINDS];
+    double last[PCR_LIMITED_LAST];
 } pcr_limited;
 
 typedef struct {

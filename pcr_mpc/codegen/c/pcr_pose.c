@@ -143,14 +143,12 @@ static double rough_critical_load(double log_tip_angle)
 /* Of d(tip) / d(log tip_angle, load), whose first zero is where a rod with its tip held loses stability. */
 static double determinant(const watch *w, double log_tip_angle, double load)
 {
-    const double unknowns[2] = {log_tip_angle, load};
-    double tip[2], jacobian[4], energy;
-    w->room.arg[0] = unknowns;
-    w->room.res[0] = tip;
-    w->room.res[1] = jacobian;
-    w->room.res[2] = &energy;
-    pcr_graph_tip_map(w->room.arg, w->room.res, w->room.iw, w->room.w);
-    return jacobian[0] * jacobian[3] - jacobian[1] * jacobian[2];
+    double found;
+    w->room.arg[0] = &log_tip_angle;
+    w->room.arg[1] = &load;
+    w->room.res[0] = &found;
+    pcr_graph_determinant(w->room.arg, w->room.res, w->room.iw, w->room.w);
+    return found;
 }
 
 /* Zero between low and high, where the determinant has two signs, by bisection and secants. */

@@ -172,10 +172,16 @@ int pcr_qp_setup(pcr_qp *qp, const pcr_qp_shape *shape, const pcr_qp_settings *s
         }
         qp->p_csc.p[j + 1] = e;
     }
-    shape_matrix(&qp->a_csc, m, n, shape->entries_a, &from);
-    memcpy(qp->a_csc.p, starts, (size_t)(n + 1) * sizeof *starts);
-    memcpy(qp->a_csc.i, rows, (size_t)shape->entries_a * sizeof *rows);
-    memcpy(qp->a_csc.x, values, (size_t)shape->entries_a * sizeof *values);
+    qp->a_csc.m = m;
+    qp->a_csc.n = n;
+    qp->a_csc.p = (int *)starts; /* OSQP writes into no pattern */
+    qp->a_csc.i = (int *)rows;
+    qp->a_csc.x = take_doubles(&from, shape->entries_a);
+    qp->a_csc.nzmax = shape->entries_a;
+    qp->a_csc.nz = -1;
+    for (int e = 0; e < shape->entries_a; e++) {
+        qp->a_csc.x[e] = values == NULL ? 1.0 : values[e];
+    }
     qp->p.csc = &qp->p_csc;
     qp->p.symmetry = TRIU;
     qp->a.csc = &qp->a_csc;

@@ -55,7 +55,8 @@ typedef struct {
 } pcr_qp;
 
 /* Build the workspace in `doubles` and `ints`, whose sizes pcr_config.h has; A's pattern is in `starts` (n + 1) and
-   `rows`, its first values in `values`. Returns 0, or PCR_LEFT_NOT_CONVEX. */
+   `rows`, which must live as long as it, its first values in `values` (NULL: ones). Returns 0, or
+   PCR_LEFT_NOT_CONVEX. */
 int pcr_qp_setup(pcr_qp *qp, const pcr_qp_shape *shape, const pcr_qp_settings *settings, const int *starts,
                  const int *rows, const double *values, double *doubles, int *ints);
 

@@ -26,6 +26,7 @@ extern const double pcr_thickness[PCR_N];                  /* half thickness of 
 extern const int pcr_kind_rows[PCR_POSE_KINDS + 1];          /* rows of each kind of limits on poses */
 extern const int pcr_kind_bits[PCR_POSE_KINDS + 1];          /* which bit of pcr_output.active is its */
 extern const pcr_qp_shape pcr_rates_shape, pcr_limited_shapes[1 << PCR_POSE_KINDS];
+extern const int pcr_limited_places[1 << PCR_POSE_KINDS];     /* of each combination in pcr_limited.last */
 extern const int pcr_rates_starts[PCR_INPUTS + 1], pcr_rates_rows[PCR_RATES_A];
 extern const double pcr_rates_values[PCR_RATES_A];
 

@@ -58,6 +58,25 @@ def tip_map() -> Any:
 
 
 @graph_cache()
+def tip_determinant() -> Any:
+    """Graph (log tip_angle, lambda) -> the determinant of the tip's Jacobian in them; not for any pull."""
+    log_tip_angle, load = ca.SX.sym("log_tip_angle"), ca.SX.sym("load")
+    found, slopes = swing_with_slopes(log_tip_angle, load)
+    jacobian = _tip_moves(found, slopes, load)
+    determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+    return ca.Function("determinant", [log_tip_angle, load], [determinant], {"cse": True})
+
+
+def _tip_moves(found: Swing, slopes: Any, load: Any) -> Any:
+    """Jacobian (2, 2) of the tip in log tip_angle and lambda."""
+    tip, quarter = _tip(found, load), ca.DM([[0, -1], [1, 0]])  # turn
+    outward = ca.vertcat(ca.horzcat(found.cos, found.sin), ca.horzcat(found.sin, -found.cos))
+    return quarter @ tip @ slopes[0, :] + ca.horzcat(
+        outward @ ca.vertcat(slopes[2, 0], slopes[1, 0]), ca.DM([1, 0]) - tip
+    ) / load  # fmt: skip
+
+
+@graph_cache()
 def rod_newton(*, any_pull: bool = False) -> tuple[Any, Any]:
     """Build the graphs of one rod; same arguments and results as `multiple_shooting.rod_newton`.
 
@@ -81,10 +100,7 @@ def rod_newton(*, any_pull: bool = False) -> tuple[Any, Any]:
 
     residual = tip - target
     quarter = ca.DM([[0, -1], [1, 0]])  # turn
-    outward = ca.vertcat(ca.horzcat(found.cos, found.sin), ca.horzcat(found.sin, -found.cos))
-    jacobian = quarter @ tip @ slopes[0, :] + ca.horzcat(
-        outward @ ca.vertcat(slopes[2, 0], slopes[1, 0]), ca.DM([1, 0]) - tip
-    ) / load  # fmt: skip
+    jacobian = _tip_moves(found, slopes, load)
     determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
     inverse = ca.vertcat(
         ca.horzcat(jacobian[1, 1], -jacobian[0, 1]), ca.horzcat(-jacobian[1, 0], jacobian[0, 0])
@@ -123,11 +139,14 @@ def rod_chord() -> Any:
 
 
 @graph_cache()
-def rod_curvature() -> Any:
+def rod_curvature(*, inline: bool = True) -> Any:
     """Graph (unknowns (3), pose (3)) -> third derivatives of the energy that hold a tip coordinate twice.
 
     Shape (4, 3): column j is the derivative of [d n_x/dx, d n_y/dx, d n_x/dy, d n_y/dy] by pose j, along the branch.
+    Unless it is ``inline``, a third of the instructions are called three times.
     """
+    if not inline:
+        return _curvature_by_calls()
     unknowns, pose = ca.SX.sym("unknowns", 3), ca.SX.sym("pose", 3)
     newton, _ = rod_newton()
     _, moves, _, load_moves, _ = newton(unknowns, pose)
@@ -136,6 +155,17 @@ def rod_curvature() -> Any:
     both = ca.vertcat(unknowns, pose)
     columns = ca.jtimes(stiffness, both, directions)
     return ca.Function("rod_curvature", [unknowns, pose], [columns], {"cse": True})
+
+
+def _curvature_by_calls() -> Any:
+    unknowns, pose = ca.MX.sym("unknowns", 3), ca.MX.sym("pose", 3)
+    newton, _ = rod_newton()
+    found = newton(unknowns, pose)
+    moves, along = found[1], newton.forward(1)
+    columns = [
+        along(unknowns, pose, *found, moves[:, j], ca.DM.eye(3)[:, j])[3][:2, :2] for j in range(3)
+    ]  # fmt: skip
+    return ca.Function("rod_curvature", [unknowns, pose], [ca.horzcat(*map(ca.vec, columns))])
 
 
 @graph_cache()
