@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from .loop.references.path_file import load_path
     from .loop.references.tabulated import Tabulated
     from .loop.run import Run, load_run
-    from .loop.scene import Scene, load_scene
+    from .loop.scene import Scene
+    from .loop.scene_file import load_scene
     from .loop.sensors import Sensors
     from .loop.simulate import simulate
     from .loop.tracking import TrackingController
@@ -188,7 +189,8 @@ _WHERE = {
     "loop.references.path_file": ("load_path",),
     "loop.references.tabulated": ("Tabulated",),
     "loop.run": ("Run", "load_run"),
-    "loop.scene": ("Scene", "load_scene"),
+    "loop.scene": ("Scene",),
+    "loop.scene_file": ("load_scene",),
     "loop.sensors": ("Sensors",),
     "loop.simulate": ("simulate",),
     "loop.tracking": ("TrackingController",),

@@ -9,7 +9,7 @@ from pathlib import Path
 from . import interrupt
 from .errors import IdentificationError, OutputError
 from .files import require_folder, require_free, results, saved
-from .loop.scene import load_scene
+from .loop.scene_file import load_scene
 from .plant.uncertainty import load_uncertainty
 from .report.excitation import excitation_record, excitation_table, plot_excitation
 from .report.identification import (

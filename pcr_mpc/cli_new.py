@@ -16,7 +16,7 @@ from .design.wish import Wish
 from .errors import InfeasibleError, ModelError, PCRError
 from .files import require_absent, require_free, write_text
 from .loop.feasibility import check_scene
-from .loop.scene import load_scene
+from .loop.scene_file import load_scene
 from .plant.robot import load_robot
 from .report.check_tables import check_record, check_table
 from .report.new_table import new_record, new_table

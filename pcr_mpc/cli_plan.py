@@ -10,7 +10,7 @@ from pathlib import Path
 
 from .errors import OutputError
 from .files import require_free, saved, stamped, write_text
-from .loop.scene import load_scene
+from .loop.scene_file import load_scene
 from .report.planning import plan_table, plot_plan
 from .study.planning.limits import PlanLimits
 from .study.planning.plan import plan_timing

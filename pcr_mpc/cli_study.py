@@ -12,7 +12,7 @@ from typing import Any
 from . import interrupt
 from .errors import OutputError
 from .files import require_folder, require_free, results, saved
-from .loop.scene import load_scene
+from .loop.scene_file import load_scene
 from .report.choice_tables import choice_record, choice_table
 from .report.csv_rows import write_rows
 from .report.tables import tuning_comments, tuning_table

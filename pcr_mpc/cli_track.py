@@ -20,7 +20,7 @@ from .loop.make_controller import make_controller
 from .loop.model_inertia import by_model_inertia
 from .loop.own_controller import OwnController
 from .loop.run import RECORD, Run
-from .loop.scene import load_scene
+from .loop.scene_file import load_scene
 from .loop.simulate import simulate
 from .loop.simulated_plant import SimulatedPlant
 from .plant.mujoco.plant import MuJoCoPlant

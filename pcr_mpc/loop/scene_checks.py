@@ -5,10 +5,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ..errors import ModelError, check_numbers, checked_vector
+import numpy as np
+
+from ..errors import ModelError, UnreachableError, check_numbers, checked_vector
 from ..files import name_problem
+from ..plant.robot import Robot
+from .trajectory import sampled
 
 LATE = ("hold", "shifted_plan")
+_MILLIMETRES = 10.0  # times too far, from which a reference may be in other units
 
 
 def is_multiple(value: float, of: float) -> bool:
@@ -53,3 +58,50 @@ def check_scene(scene: Any) -> None:
         scene.start_mode is None
     ):
         raise ModelError("give either start_tip and start_mode, or start_motors", key="start_tip")
+
+
+def require_within_stops(scene: Any) -> None:
+    """Raise if the motors are to start beyond a stop."""
+    for i, angle in enumerate(scene.start_motors or ()):
+        lower, upper = scene.robot.angle_limits[i]
+        if not lower <= angle <= upper:
+            raise ModelError(
+                f"{scene.name}: start.motors: motor {i} is to start at {angle:g} rad, beyond its stops, "
+                f"[{lower:g}, {upper:g}] rad; start within them",
+                key="start.motors",
+            )
+
+
+def require_reach(scene: Any) -> None:
+    """Raise if a rod is too short for the start or for the reference, which costs no statics to see."""
+    if scene.start_tip is not None:
+        try:
+            scene.robot.require_reachable(np.array(scene.start_tip))
+        except UnreachableError as error:
+            units = _units_hint(error.distance - error.length, scene.robot)
+            raise ModelError(f"{scene.name}: start.tip: {error}{units}", key="start.tip", **error.details) from None
+    if scene.trajectory is None:
+        return
+    t = scene.period * np.arange(scene.n_periods + 1)
+    tips = sampled(scene.trajectory, t)[:, 0]
+    robot = scene.robot
+    beyond = np.linalg.norm(tips[:, None] - robot.bases, axis=2) - robot.lengths
+    if not (outside := (beyond >= 0).any(axis=1)).any():
+        return
+    first, farthest = int(outside.argmax()), np.unravel_index(int(beyond.argmax()), beyond.shape)
+    most = float(beyond[farthest])
+    try:
+        robot.require_reachable(tips[first])
+    except UnreachableError as error:
+        worst = f"; at t = {t[farthest[0]]:.3f} s rod {farthest[1]} is {1e3 * most:.4g} mm too short"
+        raise ModelError(
+            f"{scene.name}: reference at t = {t[first]:.3f} s: {error}{worst if most > 0 else ''}"
+            f"{_units_hint(most, robot)}",
+            key="reference",
+            t=float(t[first]),
+            **error.details,
+        ) from None
+
+
+def _units_hint(short: float, robot: Robot) -> str:
+    return "; is it in millimetres?" if short > _MILLIMETRES * float(robot.lengths.max()) else ""

@@ -1,4 +1,4 @@
-"""Parts of a scene: how the plant is simulated, what is asked of it, and what the tip carries."""
+"""Parts of a scene: how the plant is simulated, what is asked of it, what the tip carries, and limits of poses."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import check_numbers
+from ..linearisation.pose_limits import PoseLimits
 from ..methods import METHODS
+from ..plant.materials import check_unit
 from ..plant.motion.plant import INTEGRATORS, ON_SNAP, Plant
 from ..plant.robot import Robot
 from ..plant.rods.equations import SCHEMES
@@ -18,6 +20,8 @@ from ..toml_table import Table
 
 RODS = ("plain", "as_built")
 PAYLOADS = ("ignored", "carried")
+# Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
+_LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
 _EARLY = 1 - 1e-9  # of a time: what is no earlier comes at that time
 
 
@@ -186,3 +190,40 @@ def read_finding(file: Table) -> Finding | None:
     with file.table("chosen") as table:
         tip_error = 1e-3 * table.number("tip_error", minimum=0.0)
         return Finding(tip_error, 1e-3 * table.number("estimated", minimum=0.0), table.text("digest"))
+
+
+def read_pose_limits(table: Table, robot: Robot) -> PoseLimits:
+    """Read limits of poses. Stability margins have defaults, for nobody wants a snap by surprise; 0 is none."""
+    corners = [table.vector(key, 2, None) for key in ("tip_lower", "tip_upper")]
+    if (corners[0] is None) != (corners[1] is None):
+        raise table.fail("tip_lower", "give both tip_lower and tip_upper, or neither")
+    if corners[0] is not None and not all(low < high for low, high in zip(*corners, strict=True)):
+        raise table.fail("tip_lower", f"{corners[0]} is not below tip_upper {corners[1]}")
+    usual = default_margins(robot)
+    return PoseLimits(
+        robot.torque_limit,
+        corners[0],
+        corners[1],
+        table.number("rod_margin", usual.rod_margin or 0.0, minimum=0.0, maximum=0.9) or None,
+        table.number("stiffness", usual.stiffness or 0.0, minimum=0.0) or None,
+        _strain_limit(table, robot),
+    )
+
+
+def _strain_limit(table: Table, robot: Robot) -> float | tuple[float, ...] | None:
+    """Of the rods' materials unless the scene has its own."""
+    if table.has("strain"):
+        own = table.number("strain", minimum=0.0)
+        check_unit("strain", own)
+        if own and all(rod.half_thickness is None for rod in robot.rods):
+            raise table.fail("strain", f"no rod of {robot.name} has a section, and so no strain is known; state it")
+        return own or None
+    return default_margins(robot).strain
+
+
+def default_margins(robot: Robot) -> PoseLimits:
+    """Limits of poses that are kept if nobody says otherwise: torque, margins to the folds, strain of the materials."""
+    softness = _LEAST_STIFFNESS * float((robot.stiffnesses / robot.lengths**3).sum())
+    limits = robot.strain_limits
+    strain = tuple(limits.tolist()) if np.isfinite(limits).any() else None
+    return PoseLimits(robot.torque_limit, None, None, _LEAST_ROD_MARGIN, softness, strain)

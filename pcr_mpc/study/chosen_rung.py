@@ -11,7 +11,7 @@ from typing import Any
 from ..errors import ModelError
 from ..files import replacing
 from ..loop.finding import digest
-from ..loop.scene import load_scene
+from ..loop.scene_file import load_scene
 from ..loop.settings import PlantSettings
 from .choice import Choice
 from .rungs import ladders, named

@@ -9,7 +9,8 @@ from pathlib import Path
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, StudyError
 from ..files import replacing, require_free, stamped
-from ..loop.scene import Scene, load_scene
+from ..loop.scene import Scene
+from ..loop.scene_file import load_scene
 from ..toml_table import read_toml
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from ...control.tuning import Tuning
 from ...errors import ModelError, checked_number
 from ...plant.robot import Robot
-from ..scene import Scene, default_margins
+from ..scene import Scene
 from ..sensors import Sensors
-from ..settings import PlantSettings
+from ..settings import PlantSettings, default_margins
 from ..trajectory import Trajectory
 
 
