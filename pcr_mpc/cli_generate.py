@@ -12,7 +12,7 @@ from .codegen.scope import check_scope
 from .codegen.subject import Subject
 from .codegen.vectors import recorded
 from .control.tuning import load_tuning
-from .loop.scene import load_scene
+from .loop.scene_file import load_scene
 
 
 def generate(options: argparse.Namespace) -> int:

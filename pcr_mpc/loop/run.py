@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import zipfile
-from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,26 +13,17 @@ from typing import Any
 import numpy as np
 
 from ..control.tuning import Tuning
-from ..errors import ModelError, PCRError
+from ..errors import ModelError
 from ..files import require_folder, results
-from ..frozen import Frozen, read_only
-from ..linearisation.linear_limits import KINDS
+from ..frozen import Frozen
 from ..plain import plain
-from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
-from ..plant.statics.stability import least_rod_margin
-from .finding import verified
+from . import run_limits, run_summary
 from .record import ARRAYS, FORMAT, from_text, record, write_csv
 from .scene import Scene
 from .settings import PlantSettings
-from .untold_delay import UntoldDelay
 
-# Commands within this of a limit keep it: rounding for rates, relative to it, the QP's tolerance for angles [rad].
-_LIMIT_SLACK = 1e-9
-_ANGLE_SLACK = 1e-5
-# Of a limit on poses, relative to it: the controller keeps them to its solver's tolerance.
-_POSE_SLACK = 1e-3
 RECORD = ("run.npz", "run.csv", "summary.json")
 
 
@@ -139,48 +128,20 @@ class Run(Frozen):
 
     def limit_violations(self) -> int:
         """Control periods in which a command broke the limit on rate, on its change, or on the angle."""
-        robot, period = self.scene.robot, self.scene.period
-        change = np.diff(self.u, axis=0, prepend=np.zeros((1, robot.n_rods)))
-        # Where the command leads from when it arrives, not where the motor's stop lets it get.
-        later = UntoldDelay(self.scene.untold_delay, self.dt, robot.n_rods)
-        first = self.scene.delay * self.steps_per_period + later.steps
-        starts = self.x[first :: self.steps_per_period, 4:][: len(self.u)]
-        lower, upper = robot.angle_limits.T
-        if later.fraction:  # the command before has the rest of a step
-            before = np.vstack([np.zeros(robot.n_rods), self.u])[: len(starts)]
-            moved = starts + later.fraction * self.dt * before
-            starts = np.clip(moved, np.minimum(lower, starts), np.maximum(upper, starts))
-        angles = starts + period * self.u[: len(starts)]
-        broken = np.abs(self.u).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.rate_limit
-        broken |= np.abs(change).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.acceleration_limit * period
-        # Coming back from beyond a stop breaks nothing.
-        outside = (angles < lower - _ANGLE_SLACK) & (angles <= starts) | (angles > upper + _ANGLE_SLACK) & (
-            angles >= starts
-        )
-        broken[: len(outside)] |= outside.any(axis=1)
-        return int(broken.sum())
+        return run_limits.limit_violations(self)
 
     @cached_property
-    def _poses(self) -> np.ndarray:
+    def pose_figures(self) -> np.ndarray:
         """Of the exact rods at the starts and ends of control periods: torques, strains, rod margin, stiffness.
 
         NaN from where the rods were lost, if they were: by a run that failed there, or by a snap.
         """
-        plant, states = Plant(self.scene.robot, dt=self.dt), self.x[:: self.steps_per_period]
-        plant.reset(self.x[0], self.pose)
-        found = np.full((len(states), 2 * self.scene.robot.n_rods + 2), np.nan)
-        for k, x in enumerate(states):
-            try:
-                eq = plant.equilibrium(x)
-            except (PCRError, ValueError):
-                break
-            found[k] = *eq.motor_torque, *eq.max_strain, least_rod_margin(eq), eq.stiffness_eigenvalues[0]
-        return read_only(found)
+        return run_limits.pose_figures(self)
 
     @property
     def torques(self) -> np.ndarray:
         """Of the motors at the starts and ends of control periods, shape (M + 1, n) [N m]; NaN where rods were lost."""
-        return self._poses[:, : self.scene.robot.n_rods]
+        return self.pose_figures[:, : self.scene.robot.n_rods]
 
     @property
     def strains(self) -> np.ndarray:
@@ -188,7 +149,7 @@ class Run(Frozen):
 
         NaN where rods were lost, or where no thickness is known.
         """
-        return self._poses[:, self.scene.robot.n_rods : -2]
+        return self.pose_figures[:, self.scene.robot.n_rods : -2]
 
     @property
     def peak_strain(self) -> float | None:
@@ -198,23 +159,7 @@ class Run(Frozen):
 
     def overstrained(self) -> list[dict[str, Any]]:
         """Events of a rod that is strained beyond its limit: one for each stretch of time, with the largest strain."""
-        limits, period = self.scene.strain_limits, self.scene.period
-        found = []
-        for i, (strains, limit) in enumerate(zip(self.strains.T, limits.tolist(), strict=True)):
-            # Written so that NaN is no excess.
-            beyond = np.concatenate([[False], strains > (1 + _POSE_SLACK) * limit, [False]])
-            for first, after in np.flatnonzero(np.diff(beyond)).reshape(-1, 2).tolist():
-                worst = first + int(strains[first:after].argmax())
-                found.append(
-                    {
-                        "t": first * period,
-                        "kind": "strain",
-                        "message": f"rod {i} is strained by up to {100 * strains[worst]:.3g} % (at t = "
-                        f"{worst * period:.3f} s), beyond its limit of {100 * limit:.3g} %, for {after - first} of "
-                        f"{len(strains)} starts and ends of periods",
-                    }
-                )
-        return sorted(found, key=lambda event: float(event["t"]))
+        return run_limits.overstrained(self)
 
     @property
     def peak_torque(self) -> float:
@@ -226,21 +171,7 @@ class Run(Frozen):
 
         The controller keeps these limits where it can, and may leave the reference for it.
         """
-        limits, tips = self.scene.pose_limits, self.x[:: self.steps_per_period, :2]
-        margins, stiffness = self._poses[:, -2:].T
-        strained = True if np.isfinite(self.scene.strain_limits).any() else None
-        given = dict(zip(KINDS, (True, limits.tip_lower, limits.rod_margin, limits.stiffness, strained), strict=True))
-        broken = {"torque": (np.abs(self.torques) > (1 + _POSE_SLACK) * self.scene.torque_limit).any(axis=1)}
-        if limits.tip_lower is not None and limits.tip_upper is not None:
-            lower, upper = np.array(limits.tip_lower), np.array(limits.tip_upper)
-            slack = _POSE_SLACK * (upper - lower)
-            broken["tip region"] = ((tips < lower - slack) | (tips > upper + slack)).any(axis=1)
-        if limits.rod_margin is not None:
-            broken["rod margin"] = margins < limits.rod_margin - _POSE_SLACK
-        if limits.stiffness is not None:
-            broken["stiffness"] = stiffness < (1 - _POSE_SLACK) * limits.stiffness
-        broken["strain"] = (self.strains > (1 + _POSE_SLACK) * self.scene.strain_limits).any(axis=1)
-        return {kind: int(broken[kind].sum()) for kind, limit in given.items() if limit is not None}
+        return run_limits.pose_violations(self)
 
     def deadline_misses(self) -> int:
         """Decisions that came after the scene's deadline, or took longer than the control period."""
@@ -254,40 +185,7 @@ class Run(Frozen):
         """
         found = [f"failed at t = {event['t']:.4g} s: {event['message']}" for event in self.events
                  if event["kind"] == "failure"]  # fmt: skip
-        return "; ".join(found + self._lost())
-
-    def _lost(self) -> list[str]:
-        """What makes a run that may have come to its end a failure."""
-        found = []
-        solved = len(self.u) - sum(event["kind"] == "fallback" for event in self.events)
-        if 2 * solved < len(self.u):
-            found.append(f"only {solved} of {len(self.u)} decisions were solved")
-        if np.isfinite(self.reference).all() and len(self.t):
-            worst = int(self.error.argmax())
-            if not self.error[worst] <= self.scene.allowed_error:  # so written that NaN is lost
-                found.append(
-                    f"tip lost: {1e3 * self.error[worst]:.1f} mm from the reference at t = {self.t[worst]:.3f} s, "
-                    f"allowed are {1e3 * self.scene.allowed_error:g} mm"
-                )
-        return found
-
-    def _need(self) -> dict[str, Any] | None:
-        """What the scene asks of the simulation, and what is known of that."""
-        need, finding = self.scene.need, self.scene.finding
-        if need is None:
-            return None
-        holds = self.rung is not None and verified(self.scene)
-        steps = float(np.median(self.plant_time)) if len(self.plant_time) else math.inf
-        control = float(np.median(self.control_time[:, 0])) if len(self.control_time) else 0.0
-        return {
-            "tip_accuracy_mm": 1e3 * need.tip_accuracy,
-            "tip_error_mm": 1e3 * finding.tip_error if finding is not None and holds else None,
-            "verified": holds,
-            "plant_step_us": 1e6 * need.plant_step,
-            "plant_step_met": steps <= need.plant_step,
-            "control_step_us": 1e6 * need.control_step,
-            "control_step_met": control <= need.control_step,
-        }
+        return "; ".join(found + run_summary.lost(self))
 
     def hash(self) -> str:
         """Digest of states and inputs: equal for runs that are equal bit for bit."""
@@ -298,61 +196,7 @@ class Run(Frozen):
 
     def summary(self) -> dict[str, Any]:
         """Figures of the run, ready for JSON; what does not apply is None."""
-        tracked = bool(np.isfinite(self.reference).all()) and len(self.t) > 0
-        error_mm = 1e3 * self.error
-        late = error_mm[self.t >= 1.0]
-        kinds = [event["kind"] for event in self.events]
-        rungs = Counter(event["rung"] for event in self.events if event["kind"] == "fallback")
-        least = float(self.scene.strain_limits.min())
-        return {
-            "scene": self.scene.name,
-            "verdict": self.verdict(),
-            "controller": self.controller,
-            "plant": self.plant,
-            "rung": plain(self.rung),
-            "need": plain(self._need()),
-            "seed": self.seed,
-            "duration_s": float(self.t[-1]),
-            "rms_mm": _rms(error_mm) if tracked else None,
-            "rms_after_1s_mm": _rms(late) if tracked and len(late) else None,
-            "max_mm": float(error_mm.max()) if tracked else None,
-            "final_error_mm": float(error_mm[-1]) if tracked else None,
-            "final_tip_m": self.x[-1, :2].tolist(),
-            "plant_step_us": percentiles(1e6 * self.plant_time),
-            "control_step_us": percentiles(1e6 * self.control_time[:, 0]),
-            "control_cpu_us": percentiles(1e6 * self.control_time[:, 5]),
-            "control_parts_us": {
-                name: percentiles(1e6 * self.control_time[:, 1 + i])
-                for i, name in enumerate(("linearise", "update", "solve", "solver"))
-            },
-            "solver_share": _share(self.control_time[:, 4], self.control_time[:, 0]),
-            "plant_budget_us": 1e6 * self.dt,
-            "control_budget_us": 1e6 * self.scene.period,
-            "qp_iterations": {
-                "p50": int(np.median(self.iterations)) if len(self.iterations) else None,
-                "max": int(self.iterations.max(initial=0)),
-            },
-            "asked": self.asked,
-            "peak_torque_Nm": self.peak_torque,
-            "torque_limit_Nm": self.scene.torque_limit,
-            "peak_strain": self.peak_strain,
-            "strain_limit": least if math.isfinite(least) else None,
-            "pose_violations": self.pose_violations(),
-            "statics_rungs": self.rungs,
-            "limit_violations": self.limit_violations(),
-            "control_steps": len(self.u),
-            "active_limits": self.active_limits,
-            "slack": self.slack,
-            "fallbacks": kinds.count("fallback"),
-            "control_rungs": {"solved": len(self.u) - kinds.count("fallback"), **rungs},
-            "deadline_misses": self.deadline_misses(),
-            "snaps": kinds.count("snap"),
-            "warnings": kinds.count("warning"),
-            "refused_measurements": kinds.count("measurement"),
-            "failures": kinds.count("failure") or len(self._lost()),
-            "events": sorted([*self.events, *self.overstrained()], key=lambda event: float(event["t"])),
-            "run_hash": self.hash(),
-        }
+        return run_summary.summary(self)
 
     def save(self, folder: str | Path, *, force: bool = False) -> dict[str, str]:
         """Write run.npz, run.csv and summary.json; return their paths by name.
@@ -373,7 +217,7 @@ class Run(Frozen):
         files = {name: str(folder / name) for name in RECORD}
         require_folder(folder, files, force=force)
         with results(folder) as staged:
-            np.savez_compressed(staged / "run.npz", **record(self), need=json.dumps(plain(self._need())))
+            np.savez_compressed(staged / "run.npz", **record(self), need=json.dumps(plain(run_summary.need_of(self))))
             write_csv(self, staged / "run.csv")
             text = json.dumps({**self.summary(), "files": files}, indent=2)
             (staged / "summary.json").write_text(text + "\n", encoding="utf-8")
@@ -407,19 +251,3 @@ def load_run(folder: str | Path) -> Run:
         if isinstance(error, ModelError) and "file" in error.details:
             raise
         raise ModelError(f"{path}: no complete record of a run: {error}; run it again", file=str(path)) from error
-
-
-def percentiles(values: np.ndarray) -> dict[str, float | None]:
-    """p50, p95, p99 and maximum; None where there is nothing to count."""
-    if not len(values):
-        return dict.fromkeys(("p50", "p95", "p99", "max"))
-    p50, p95, p99 = np.percentile(values, [50, 95, 99])
-    return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(values.max())}
-
-
-def _share(part: np.ndarray, whole: np.ndarray) -> float | None:
-    return float(part.sum() / whole.sum()) if whole.sum() else None
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
