@@ -24,10 +24,11 @@ from .loop.scene_file import load_scene
 from .loop.simulate import simulate
 from .loop.simulated_plant import SimulatedPlant
 from .plant.mujoco.plant import MuJoCoPlant
+from .report.laps import plot_laps
 from .report.plots import animate_run, plot_run
 from .report.tables import summary_table
 
-_PICTURES = ("track.png", "track.gif")
+_PICTURES, _LEARNT = ("track.png", "track.gif"), ("laps.png",)
 
 
 def track(options: argparse.Namespace) -> int:
@@ -52,7 +53,9 @@ def track(options: argparse.Namespace) -> int:
         plant = scene.make_plant()
     folder = options.out or Path("results") / scene.name
     # Rather now than after the run.
-    require_folder(folder, RECORD if options.no_pictures else (*RECORD, *_PICTURES), force=options.overwrite)
+    used: Tuning | None = None if own else tuning or scene.tuning
+    drawn = () if options.no_pictures else _pictures(used)
+    require_folder(folder, (*RECORD, *drawn), force=options.overwrite)
     failure: SimulationError | None = None
     try:
         run = simulate(scene, plant, controller, options.seed, progress=True)
@@ -60,7 +63,6 @@ def track(options: argparse.Namespace) -> int:
         failure, run = error, error.run
     folder, problem = saved(partial(run.save, force=options.overwrite), folder)
     summary = run.summary()
-    used: Tuning | None = None if own else tuning or scene.tuning
     if options.plant and used is not None and failure is None:
         summary["by_model_inertia"] = by_model_inertia(run, used, plant, progress=True)
     # Of a run that was interrupted the record is enough: who presses Ctrl-C wants no pictures.
@@ -79,19 +81,25 @@ def track(options: argparse.Namespace) -> int:
 def _complete(run: Run, summary: dict[str, Any], pictures: bool, folder: Path) -> None:
     """Add the pictures, and to the summary where everything is."""
     with results(folder, keep=RECORD) as staged:
-        drawn = _PICTURES if pictures and _drawn(run, staged) else ()
+        drawn = _pictures(run.tuning) if pictures and _drawn(run, staged) else ()
         summary["files"] = {name: str(folder / name) for name in (*RECORD, *drawn)}
         (staged / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
+def _pictures(tuning: Tuning | None) -> tuple[str, ...]:
+    return (*_PICTURES, *_LEARNT) if tuning is not None and tuning.learning is not None else _PICTURES
+
+
 def _drawn(run: Run, folder: Path) -> bool:
     """Draw a run; what cannot be drawn, as a robot that was lost, is said and no reason to lose the figures."""
-    picture, animation = (folder / name for name in _PICTURES)
+    paths = [folder / name for name in _pictures(run.tuning)]
     try:
-        plot_run(run, picture)
-        animate_run(run, animation, progress=True)
+        plot_run(run, paths[0])
+        animate_run(run, paths[1], progress=True)
+        for path in paths[2:]:
+            plot_laps(run, path)
     except (PCRError, ValueError) as error:
-        for path in (picture, animation):
+        for path in paths:
             path.unlink(missing_ok=True)
         print(f"pcr-mpc: no pictures: {error}", file=sys.stderr)
         return False

@@ -21,7 +21,7 @@ from .qp import QuadraticProgram, Reference, assemble, model_sequence
 from .tuning import Limits, Tuning, time_unit
 from .workspace import Workspace
 
-_NOT_OF_THE_PROBLEM = ("name", "fallback", "model", "observer", "pd", "period")  # fields of a tuning
+_NOT_OF_THE_PROBLEM = ("name", "fallback", "model", "observer", "pd", "period", "learning")  # fields of a tuning
 # Between the sizes of one problem and the next: then the last one says nothing about this one.
 _JUMP = 1e3
 _LONG = 24  # periods

@@ -13,7 +13,7 @@ from ..errors import ModelError, checked_integer, checked_number, checked_vector
 from ..files import name_problem
 from ..frozen import Frozen
 from ..methods import METHODS
-from ..toml_table import read_toml
+from ..toml_table import Table, read_toml
 from .observer import ObserverTuning
 
 SCHEMES = ("rk4", "rk8")
@@ -74,6 +74,26 @@ class Model:
 
 
 @dataclass(frozen=True)
+class LearningTuning:
+    """How the feed-forward is learnt from lap to lap.
+
+    Attributes
+    ----------
+    gain : float
+        Share of a lap's error that is taken off the next one, at most 1.
+    bandwidth : float
+        Of what is learnt [Hz].
+    """
+
+    gain: float = 0.7
+    bandwidth: float = 4.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gain", checked_number("gain", self.gain, above=0.0, maximum=1.0))
+        object.__setattr__(self, "bandwidth", checked_number("bandwidth", self.bandwidth, above=0.0))
+
+
+@dataclass(frozen=True)
 class Tuning:
     """Tuning of a controller; what its law has no use for is ignored.
 
@@ -103,6 +123,8 @@ class Tuning:
         Control period for which it was tuned [s]. None: the scene's.
     solver : {"osqp", "daqp"}
         Of the QPs: a first-order method, or a dense active set.
+    learning : LearningTuning or None
+        Of a reference that comes round. None: every lap is as the first.
     """
 
     name: str
@@ -120,6 +142,7 @@ class Tuning:
     pd: tuple[float, float] = (0.0, 0.0)
     period: float | None = None
     solver: str = SOLVERS[0]
+    learning: LearningTuning | None = None
 
     def __post_init__(self) -> None:
         for name, count in (("horizon", self.horizon), ("max_iterations", self.max_iterations)):
@@ -276,6 +299,7 @@ def load_tuning(path: str | Path) -> Tuning:
         file.table("solver", {}) as solver,
         file.table("model", {}) as model,
         file.table("observer", {}) as observer,
+        file.table("learning", {}) as learning,
     ):
         observed = observer.boolean("on", False)
         noise = ObserverTuning(
@@ -318,4 +342,14 @@ def load_tuning(path: str | Path) -> Tuning:
                 compiled=model.boolean("compiled", Model.compiled),
             ),
             observer=noise if observed else None,
+            learning=_learning(learning),
         )
+
+
+def _learning(table: Table) -> LearningTuning | None:
+    on = table.boolean("on", False)
+    found = LearningTuning(
+        gain=table.number("gain", LearningTuning.gain, above=0.0, maximum=1.0),
+        bandwidth=table.number("bandwidth", LearningTuning.bandwidth, above=0.0),
+    )
+    return found if on else None

@@ -25,6 +25,7 @@ from ..plant.statics.equilibrium import Equilibrium
 from .controllers import Decision
 from .foresight import Foresight, Outlook
 from .gate import Event, Gate
+from .learning.learner import Learner
 from .live.reference import LiveReference
 from .parts import resting_state
 from .target import MotorTarget
@@ -49,10 +50,10 @@ class ControlStep:
 
     Attributes
     ----------
-    law, foresight, observer, watch, track, delay, fallback
+    law, foresight, observer, watch, track, learner, delay, fallback
         Set, and set anew, by the controller between two steps: the control law, what looks ahead, the observer or None,
-        the limits of a pose, windows of the reference, the periods that are predicted over, and whether a failure is
-        raised.
+        the limits of a pose, windows of the reference, what learns from its laps or None, the periods that are
+        predicted over, and whether a failure is raised.
     inverse : MotorTarget
     pose : Equilibrium
         In which the robot was last known to be.
@@ -79,6 +80,7 @@ class ControlStep:
         self.robot, self.limits = robot, limits
         self._period, self._gate = period, gate
         self.observer: DisturbanceObserver | None = None
+        self.learner: Learner | None = None
         self.inverse = MotorTarget(robot)
         self.delay, self.k, self.believed = 0, -1, (True, True)
         self.u = self.turning = np.zeros(robot.n_rods)
@@ -104,6 +106,8 @@ class ControlStep:
         self.watch.reset(x, pose)
         self.inverse.start(pose)
         self._gate.start(pose.q)
+        if self.learner is not None:
+            self.learner.reset()
         self._predicts = LinearModels.of([resting])
         rest = np.zeros(self.robot.n_rods)
         self.sent = deque([rest] * delay, maxlen=delay)
@@ -212,6 +216,8 @@ class ControlStep:
                 expected[4:] = found.q
         elif found.velocity is not None:
             observer.move(found.p, found.velocity)
+        if self.learner is not None:
+            self.learner.see(k, found.p)
         measured = given["measured"]
         measured[:2] = expected[:2] if found.p is None else found.p
         measured[2:] = expected[4:] if found.q is None else found.q

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..control.observer import ObserverTuning
-from ..control.tuning import Model, Tuning
+from ..control.tuning import LearningTuning, Model, Tuning
 from ..errors import ModelError
 from ..linearisation.pose_limits import PoseLimits
 from ..plant.robot import Robot
@@ -76,7 +76,7 @@ class Recorded:
 
 _KINDS: tuple[type, ...] = (
     Scene, Robot, Rod, PlantSettings, Payload, Need, Finding, PoseLimits, Motors, Tuning, Model, ObserverTuning,
-    *KINDS, Recorded, Equilibrium,
+    LearningTuning, *KINDS, Recorded, Equilibrium,
 )  # fmt: skip
 _BY_NAME = {kind.__name__: kind for kind in _KINDS}
 

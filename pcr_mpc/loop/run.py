@@ -7,6 +7,7 @@ import json
 import zipfile
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from ..plain import plain
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from . import run_limits, run_summary
+from .learning.laps import Laps, laps_of
 from .record import ARRAYS, FORMAT, from_text, record, write_csv
 from .scene import Scene
 from .settings import PlantSettings
@@ -125,6 +127,18 @@ class Run(Frozen):
     def error(self) -> np.ndarray:
         """Distance of the tip from the reference, shape (K + 1,) [m]."""
         return np.asarray(np.hypot(*(self.x[:, :2] - self.reference).T))
+
+    def laps(self) -> Laps | None:
+        """Laps of the reference that were run; None where it does not come round."""
+        return laps_of(self.scene.trajectory, float(self.t[-1]))
+
+    def lap_errors(self) -> np.ndarray:
+        """RMS distance of the tip from the reference in each whole lap at full speed, shape (laps,) [m]."""
+        laps = self.laps()
+        if laps is None:
+            return np.empty(0)
+        edges = laps.edges(self.scene.period) * self.steps_per_period
+        return np.array([np.sqrt(np.mean(self.error[a:b] ** 2)) for a, b in pairwise(edges.tolist())])
 
     def limit_violations(self) -> int:
         """Control periods in which a command broke the limit on rate, on its change, or on the angle."""

@@ -68,6 +68,7 @@ def summary(run: Any) -> dict[str, Any]:
         "failures": kinds.count("failure") or len(lost(run)),
         "events": sorted([*run.events, *run.overstrained()], key=lambda event: float(event["t"])),
         "run_hash": run.hash(),
+        **({"laps_rms_mm": (1e3 * run.lap_errors()).tolist()} if run.tuning and run.tuning.learning else {}),
     }
 
 

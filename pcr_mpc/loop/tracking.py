@@ -22,6 +22,7 @@ from .control_step import ControlStep
 from .controllers import Decision
 from .feed_forward import InverseDynamics, feed_forward
 from .foresight import Foresight
+from .learning.learner import learning_on
 from .live.loop import LiveLoop
 from .live.on_the_fly import OnTheFly
 from .live.rows import Asked
@@ -137,9 +138,9 @@ class TrackingController(OnTheFly, Remade):
         """Get ready for a loop that keeps its own time, in a pose under a load."""
         note = self._require_observer()
         self._work.pose, self._work.u = found.pose, np.zeros(self.robot.n_rods)
-        if self._live is None or not self._live.fits(self._asked()):
-            self._live = LiveLoop(self._work, self._asked(), self._sensors)
         live = self._live
+        if live is None or not live.fits(self._asked()):
+            live = self._make_live()
         live.reference.start(found.pose, 0)
         self._work.track = live.reference
         self._begin(found.pose)
@@ -250,19 +251,26 @@ class TrackingController(OnTheFly, Remade):
             raise PCRError(f"controller {self.name} was not started: call start(pose) or start(p, q) first")
         if self._live is None:
             note = self._require_observer()
-            self._live = LiveLoop(self._work, self._asked(), self._sensors)
+            self._live = self._make_live()
             self._live.notes += note
             self._live.take_over(self._reference, self._work.k, self._work.pose, self._scene.trajectory)
             self._work.track = self._live.reference
         return self._live
 
+    def _make_live(self) -> LiveLoop:
+        self._work.learner, self._live = None, LiveLoop(self._work, self._asked(), self._sensors)
+        return self._live
+
     def _require_observer(self) -> list[tuple[str, str]]:
         """Put the default observer into a tuning that has none: nobody measures the velocity in a loop of one's own."""
-        if self.tuning.observer is not None:
-            return []
-        self.retune(replace(self.tuning, observer=ObserverTuning()))
-        return [("observer", f"tuning {self.tuning.name} has no observer, and no velocity is measured: the default "
-                 "observer estimates it, and an unknown force")]  # fmt: skip
+        name, notes = self.tuning.name, []
+        if self.tuning.learning is not None:
+            notes.append(("learning", f"tuning {name} learns from laps, which a reference that may change has not"))
+        if self.tuning.observer is None:
+            self.retune(replace(self.tuning, observer=ObserverTuning()))
+            notes.append(("observer", f"tuning {name} has no observer, and no velocity is measured: the default "
+                          "observer estimates it, and an unknown force"))  # fmt: skip
+        return notes
 
     def _asked(self) -> Asked:
         scene, tuning = self._scene, self.tuning
@@ -286,7 +294,8 @@ class TrackingController(OnTheFly, Remade):
         scene, work, horizon = self._scene, self._work, self.tuning.horizon
         tail = horizon + work.delay
         self._reference = known or feed_forward(scene, self.robot, work.pose, tail, self.tuning.model.inertia)
-        work.track = track_of(scene, self.robot, work.pose, self._reference, horizon, tail)
+        track = track_of(scene, self.robot, work.pose, self._reference, horizon, tail)
+        work.track, work.learner = learning_on(track, scene, self.tuning, work, self._reference, work.learner)
 
     def _rest(self) -> LinearModel:
         """Linear model about the start."""

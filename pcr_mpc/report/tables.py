@@ -51,6 +51,9 @@ def summary_table(summary: dict[str, Any]) -> str:
     if summary["rms_mm"] is not None:
         rows = [(name, "-" if summary[key] is None else f"{summary[key]:.4f}") for name, key in tracking]
         lines += [table(("tracking error", "mm"), rows), ""]
+    if summary.get("laps_rms_mm"):
+        rows = [(f"  lap {i}", f"{error:.4f}") for i, error in enumerate(summary["laps_rms_mm"], start=1)]
+        lines += [table(("learning: RMS of each lap at full speed", "mm"), rows), ""]
     if "by_model_inertia" in summary:
         rows = [
             (f"  {inertia}", *("-" if figures[key] is None else f"{figures[key]:.4f}" for _, key in tracking[:3]))

@@ -117,6 +117,14 @@ def _toml(tuning: Tuning, comments: Sequence[str]) -> str:
             _line("force_noise", observer.force_noise, "N, forces that come and go"),
             _line("force_walk", observer.force_walk, "N, change of the unknown force in a period"),
         ]
+    if tuning.learning is not None:
+        lines += [
+            "",
+            "[learning]",
+            f"{'on = true':26}# of the feed-forward, from lap to lap",
+            _line("gain", tuning.learning.gain, "share of a lap's error that is taken off the next one"),
+            _line("bandwidth", tuning.learning.bandwidth, "Hz, of what is learnt"),
+        ]
     return "\n".join(lines) + "\n"
 
 

@@ -61,12 +61,12 @@ class Blended:
             object.__setattr__(self, "repeat", FOR_EVER)  # which prints as what can be read again
         if self.repeat != FOR_EVER:
             check_numbers(self, {"repeat": {"minimum": 1.0}})
-            if self._laps != round(self._laps):
-                raise ModelError(f"repeat: expected a whole number, or for ever, found {self._laps:g}", key="repeat")
+            if self.laps != round(self.laps):
+                raise ModelError(f"repeat: expected a whole number, or for ever, found {self.laps:g}", key="repeat")
         for name in ("start", "end"):
             if getattr(self, name) is not None:
                 check_numbers(self, {name: {"minimum": 0.0}})
-        if self._laps > 1:
+        if self.laps > 1:
             self._require_closed()
         if self.end is not None and math.isinf(self._own):
             raise ModelError("a path that never ends has no end to blend; leave out end, or repeat it less", key="end")
@@ -86,8 +86,21 @@ class Blended:
         return np.stack([place, velocity * rate, acceleration * rate**2 + velocity * change], axis=1)
 
     @property
-    def _laps(self) -> float:
+    def laps(self) -> float:
+        """How many times it is gone along; infinite for ever."""
         return math.inf if isinstance(self.repeat, str) else self.repeat
+
+    @property
+    def full_speed(self) -> tuple[float, float, float]:
+        """When the first blend ends, how long a lap takes from then on, and when the last blend begins [s]."""
+        start, end = self._blends
+        return self.time_scale * start, self.time_scale * self._lap, self.duration - self.time_scale * end
+
+    def clock(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Laps gone at the times t [s], their rate [1/s] and its change [1/s^2]; of a path that has laps."""
+        own, rate, change = self._warped(np.asarray(t, dtype=float) / self.time_scale)
+        scale = self._lap * self.time_scale
+        return own / self._lap, rate / scale, change / (scale * self.time_scale)
 
     @property
     def _lap(self) -> float:
@@ -96,13 +109,13 @@ class Blended:
     @property
     def _own(self) -> float:
         """The path's own time in which it is all gone along [s]."""
-        return self._laps * self._lap
+        return self.laps * self._lap
 
     def _within(self, own: np.ndarray) -> np.ndarray:
         """The path's own time within a lap."""
-        if self._laps == 1 or math.isinf(self._lap):
+        if self.laps == 1 or math.isinf(self._lap):
             return own
-        laps = np.minimum(np.floor(own / self._lap), self._laps - 1)
+        laps = np.minimum(np.floor(own / self._lap), self.laps - 1)
         return np.asarray(np.clip(own - laps * self._lap, 0.0, self._lap))
 
     def _warped(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

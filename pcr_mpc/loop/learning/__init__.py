@@ -1,0 +1,1 @@
+"""Laps of a reference, and what is learnt from one to the next."""
