@@ -23,6 +23,7 @@ PREDICTING = tuple(method for method in METHODS if method != "single_shooting")
 LINEARISE = ("here", "along_plan")
 INERTIAS = ("none", "constant", "condensed")
 FALLBACKS = ("ladder", "raise")
+ANGLES = ("measured", "commanded")
 # Two sums of the same commands differ by rounding [rad].
 SAME_ANGLE = 1e-9
 _MET = 1e-12  # of the limit on the change of rate, by which a change that meets it may be less
@@ -47,6 +48,13 @@ class Model:
         Follow the scene's time table of what the tip carries, in the feed-forward and in what is linearised.
     predict_delay : bool
         Plan from where the commands that are on the way will have brought the robot.
+    angles : {"measured", "commanded"}
+        Plan from the measured motor angles; or from those to which the commands lead, to which the measured ones pull
+        slowly. Then a motor that lags or is late, by whatever time, is not told to turn twice; and what the motors do
+        is no surprise to the observer.
+    motor_lag : float
+        Time by which the motors are known to be late, or to lag, with "commanded" angles [s]. It is where the fit to
+        their measured angles begins.
     compiled : bool
         Run as machine code where there is a C compiler: the same numbers, several times faster.
     """
@@ -59,6 +67,8 @@ class Model:
     linearise: str = "here"
     payload: bool = True
     predict_delay: bool = True
+    angles: str = ANGLES[0]
+    motor_lag: float = 0.0
     compiled: bool = True
 
     def __post_init__(self) -> None:
@@ -69,8 +79,15 @@ class Model:
             ("scheme", SCHEMES),
             ("inertia", INERTIAS),
             ("linearise", LINEARISE),
+            ("angles", ANGLES),
         ):
             _check_choice(name, getattr(self, name), choices)
+        object.__setattr__(self, "motor_lag", checked_number("motor_lag", self.motor_lag, minimum=0.0))
+        if self.motor_lag and self.angles == "measured":
+            raise ModelError(
+                f"motor_lag is {self.motor_lag} s, and measured angles know none: set angles = 'commanded'",
+                key="angles",
+            )
 
 
 @dataclass(frozen=True)
@@ -339,6 +356,8 @@ def load_tuning(path: str | Path) -> Tuning:
                 linearise=model.text("linearise", Model.linearise, choices=LINEARISE),
                 payload=model.boolean("payload", Model.payload),
                 predict_delay=model.boolean("predict_delay", Model.predict_delay),
+                angles=model.text("angles", Model.angles, choices=ANGLES),
+                motor_lag=model.number("motor_lag", Model.motor_lag, minimum=0.0),
                 compiled=model.boolean("compiled", Model.compiled),
             ),
             observer=noise if observed else None,

@@ -278,7 +278,11 @@ class ControlStep:
             # A plan may know better than the models that it was asked for with.
             better = outlook.models.copy() if plan.models is None or plan.fallback else plan.models
             self._predicts = LinearModels.of([better] if isinstance(better, LinearModel) else better)
-        if foreseen and plan.states is not None and not plan.fallback:
+        if self.foresight.inputs["pull"][0] < 1.0:
+            # The plan is of commanded angles, and so are its states and models.
+            if outlook is not None:
+                self._predicts = outlook.first.copy()
+        elif foreseen and plan.states is not None and not plan.fallback:
             return np.asarray(plan.states[1])
         return self._predicts[0](estimate, arriving)
 

@@ -30,8 +30,9 @@ class Outlook:
         State when the decision reaches the motors.
     arriving : ndarray, shape (4 + n,)
         State at the end of the period; without a delay the one at its start.
-    now, models : LinearModels
-        For the period that begins now, length 1; from there on, length 1 or N.
+    now, first, models : LinearModels
+        For the period that begins now, length 1, of angles that are planned from and of the motors' own; from there on,
+        length 1 or N.
     record : ndarray
         Of the rods there (see `warm_calls`).
     shift : ndarray, shape (n,)
@@ -49,6 +50,7 @@ class Outlook:
     ahead: np.ndarray
     arriving: np.ndarray
     now: LinearModels
+    first: LinearModels
     models: LinearModels
     record: np.ndarray
     shift: np.ndarray
@@ -121,12 +123,13 @@ class Foresight:
         self.rows |= {"states": self.window[:, : 4 + n], "inputs": self.window[:, 4 + n : -2]}
         given["end_force"] = self.window[-1, -2:]
         given["dt"][:], given["target_numbers"][:] = period, target.numbers
+        given["pull"][:], given["prior"][:] = 1.0, (0.0, 1.0)  # from measured angles, with motors that follow at once
         # What the next period starts from: in it each place is where its neighbour is now.
-        names = "records", "target", "shift", "reckoned"
+        names = "records", "target", "shift", "reckoned", "lead", "moves", "lags"
         before = sum(view.size for name, view in zip(function.name_in(), graph.inputs, strict=True)
                      if function.index_in(name) < function.index_in(names[0]))  # fmt: skip
         self._memory = graph.memory_in[before : before + sum(given[name].size for name in names)]
-        self._next = graph.memory_out[ends["moved_reckoned"] - self._memory.size : ends["moved_reckoned"]]
+        self._next = graph.memory_out[ends["next_lags"] - self._memory.size : ends["next_lags"]]
         self._records = self.rows["records"]
         self._decisions = found["decisions"]
         self.corrected, self.strayed = found["corrected"], 0.0
@@ -143,6 +146,7 @@ class Foresight:
             ahead=found["ahead"],
             arriving=found["arriving"],
             now=(now if places.delay else models)[:1],
+            first=LinearModels(found["first"].reshape(-1, 1), period, force),
             models=models,
             record=_column(found["followed"], places.delay),
             shift=found["moved_shift"],
@@ -169,6 +173,8 @@ class Foresight:
         self.inputs["target"][:] = self._target_plant.record
         self.inputs["shift"][:], self.inputs["u_previous"][:] = 0.0, 0.0
         self.inputs["reckoned"][:] = x[4:]
+        for name in ("lead", "moves", "lags"):
+            self.inputs[name][:] = 0.0
         self._records[:] = self._plant.record
 
     def pose(self, x: np.ndarray) -> Equilibrium:
@@ -189,7 +195,7 @@ class Foresight:
 
     def target_from(self, other: Foresight) -> None:
         """Go on with the motor target, and the sum of the commands, of another one of the same robot."""
-        for name in ("target", "shift", "reckoned"):
+        for name in ("target", "shift", "reckoned", "lead", "moves", "lags"):
             self.inputs[name][:] = other.inputs[name]
 
     def __call__(self) -> Outlook:

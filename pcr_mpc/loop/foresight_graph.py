@@ -26,6 +26,7 @@ from ..plant.rods.follower import BRANCH_CHANGE
 _SOLVED, _DERIVATIVES = 1e-8, 1e-4
 _LARGEST_STEP = 0.1  # of the motor target in a period [rad]
 _VERDICT = [_SOLVED, _DERIVATIVES, BRANCH_CHANGE, 0.0, LARGEST_DRIFT]
+_LATEST = 10.0  # periods that motors may be late
 _SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
 
 
@@ -92,6 +93,11 @@ def foresight_graph(
         "target": ca.MX.sym("target", of_target.record),
         "shift": ca.MX.sym("shift", n),
         "reckoned": ca.MX.sym("reckoned", n),  # where the commands have led, whatever was measured [rad]
+        "lead": ca.MX.sym("lead", n),  # of the angles to plan from, over the sum of the commands [rad]
+        "moves": ca.MX.sym("moves", 4, n),  # of the tip in the last period, for an angle that was not foreseen
+        "lags": ca.MX.sym("lags", 2),  # of the motors: sums over reference rates times what is on its way, and squared
+        "pull": ca.MX.sym("pull"),  # of measured angles on those to plan from, in a period; 1: these are the measured
+        "prior": ca.MX.sym("prior", 2),  # what ``lags`` have beside
         "carries": ca.MX.sym("carries"),  # 1: the motor target carries the observed force, 0: it stays
         "numbers": ca.MX.sym("numbers", model.kind.size),
         "target_numbers": ca.MX.sym("target_numbers", target.kind.size),
@@ -105,7 +111,7 @@ def foresight_graph(
     }
     given = SimpleNamespace(**inputs)
     given.states, given.inputs, given.forces = ca.vertsplit(given.window, [0, 4 + n, 4 + 2 * n, 6 + 2 * n])
-    corrected = correction(n)(given.estimate, given.measured, given.gain, given.half_step)
+    corrected = _corrected(given, n)
     x, force = corrected[:-2], corrected[-2:]
     graph_of = model_list if inline else model_graph
     found = [_place(graph_of, model, given, x, force, 0, last=count == 1)]
@@ -114,29 +120,79 @@ def foresight_graph(
         ahead = _moved(found[j][1], ahead, given.on_the_way[:, j], n)
         arriving = ahead if j == 0 else arriving
         found.append(_place(graph_of, model, given, ahead, force, j + 1, last=j + 1 == count - 1))
+    due, rates = _due(given, places.horizon)
     for j in range(places.delay + 1, count):
-        there = given.path[:, j - places.delay - 1]
+        there = given.path[:, j - places.delay - 1] - ca.vertcat(ca.DM.zeros(4), due[:, j - places.delay])
         found.append(_place(graph_of, model, given, there, force, j, last=j == count - 1))
     records, models, good, states_of = (ca.horzcat(*columns) for columns in zip(*found, strict=True))
     shift, target_record, target_good = _shifted(target, given, force, n)
-    states = given.states + ca.vertcat(ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon))
+    states = given.states + ca.vertcat(
+        ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon) + due[:, 1:]
+    )  # fmt: skip
     reckoned, of_plan = given.reckoned + given.dt * given.u_previous, models[:, places.delay :]
+    # Angles that commands lead to and that are not measured are on their way, or slowly given up for lost.
+    had_followed = ahead[4:] + due[:, 0]
+    planned = had_followed + (1 - given.pull) * (reckoned + given.lead - had_followed)
+    lags = (1 - given.pull) * given.lags + ca.vertcat(ca.dot(rates, planned - ahead[4:]), ca.sumsqr(rates))
+    ahead = ca.vertcat(ahead[:4], planned)
+    changes = (due[:, 1:] - due[:, :-1]) / given.dt
+    by_rate = ca.reshape(models[(4 + n) * (5 + n) : (4 + n) * (5 + 2 * n), 0], 4 + n, n)[:4, :]
+    of_plan = ca.horzcat(*(_behind(of_plan[:, j], due[:, j], changes[:, j], n) for j in range(places.models)))
     qp: Any = [ca.MX(0, 1)] * 4
     measures = ca.MX.zeros(3)
     if condense is not None:
-        *qp, measures = condense(of_plan, ahead, states, given.inputs, given.u_previous, given.weights, given.terminal,
-                                 given.bounds, given.dt)  # fmt: skip
+        *qp, measures = condense(of_plan, ahead, states, given.inputs + changes, given.u_previous, given.weights,
+                                 given.terminal, given.bounds, given.dt)  # fmt: skip
     good = ca.vertcat(good.T, target_good)
     outputs = {
-        "corrected": corrected, "arriving": arriving, "places": states_of, "wanted": states,
+        "first": models[:, 0], "corrected": corrected, "arriving": arriving, "places": states_of, "wanted": states,
         "carried": given.forces + force, "signs": _signs(model, given, records[:, places.delay]), "good": good,
         "decisions": ca.vertcat(ca.mmin(good), ca.norm_inf(reckoned - ahead[4:]), measures),
         "followed": records, "stays": records[:, -1], "followed_target": target_record, "moved_shift": shift,
-        "moved_reckoned": reckoned,
+        "moved_reckoned": reckoned, "moved_lead": planned - reckoned,
+        "next_moves": (given.pull < 1) * by_rate / given.dt, "next_lags": (given.pull < 1) * lags,
         "now": models[:, : places.delay], "models": of_plan, "ahead": ahead, "P": qp[0], "q": qp[1], "l": qp[2],
         "u": qp[3],
     }  # fmt: skip
     return ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
+
+
+def _corrected(given: Any, n: int) -> Any:
+    """State and force after the measurement; the tip has moved with the angles as they are measured to have turned."""
+    estimate, measured = given.estimate, given.measured
+    p, q = estimate[:2], estimate[4:-2]
+    turned = ca.fmin(ca.fmax(q, measured[2:] - given.half_step), measured[2:] + given.half_step) - q
+    tip = estimate[:4] + given.moves @ turned
+    # A tip that is told to be exactly where it was expected was not measured.
+    missing = ca.logic_and(measured[0] == p[0], measured[1] == p[1])
+    seen = ca.vertcat(ca.if_else(missing, tip[0], measured[0]), ca.if_else(missing, tip[1], measured[1]))
+    return correction(n)(ca.vertcat(tip, estimate[4:]), ca.vertcat(seen, measured[2:]), given.gain, given.half_step)
+
+
+def _due(given: Any, horizon: int) -> tuple[Any, Any]:
+    """Angles by which commands that track the reference are ahead of the motors, at the ends of the periods, the start
+    first, and the rates of the reference there.
+
+    A motor that is late by a time, or lags with it as a time constant, is behind by that time's way. The time is fitted
+    to what is on its way; the reference, and no answer of the controller, says when.
+    """
+    rates = given.inputs
+    time = ca.fmin(ca.fmax((given.prior[0] + given.lags[0]) / (given.prior[1] + given.lags[1]), 0), _LATEST * given.dt)
+    ends: list[Any] = [rates[:, 0], rates[:, -1]]
+    if horizon > 1:
+        ends = [1.5 * rates[:, 0] - 0.5 * rates[:, 1], 1.5 * rates[:, -1] - 0.5 * rates[:, -2]]
+    between = (rates[:, 1:] + rates[:, :-1]) / 2
+    return time * ca.horzcat(ends[0], between, ends[1]), ends[0]
+
+
+def _behind(packed: Any, due: Any, change: Any, n: int) -> Any:
+    """Model of a tip whose motors are behind the angles of its state by ``due``, which changes at a rate."""
+    n_states = 4 + n
+    ends = [0, n_states**2, n_states * (n_states + 1), n_states * (n_states + 1 + n), packed.size1()]
+    parts: list[Any] = ca.vertsplit(packed, ends)
+    a, c, b, e = parts
+    by_angle, by_rate = ca.reshape(a, n_states, n_states)[:4, 4:], ca.reshape(b, n_states, n)[:4, :]
+    return ca.vertcat(a, c[:4] - by_angle @ due - by_rate @ change, c[4:], b, e)
 
 
 def _place(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -22,6 +23,10 @@ from .foresight import Foresight
 from .foresight_graph import Places
 from .gate import Gate
 from .scene import Scene
+
+# In which an angle that was commanded and is not measured counts as lost [s]: many times what motors lag.
+_FORGETTING = 2.0
+_SLOW = 0.01  # of the greatest rate: from slower motions no lag is learnt
 
 
 def motor_limits(robot: Robot, period: float) -> Limits:
@@ -120,3 +125,11 @@ def write_constants(
     else:
         given["gain"][:], given["half_step"][:], given["estimate"][-2:] = 0.0, 0.0, 0.0
     given["carries"][:] = observer is not None
+    given["pull"][:] = pull(tuning.model, float(given["dt"][0]))
+    slow = _SLOW * min(limits.rate, 1.0 / float(given["dt"][0]))
+    given["prior"][:] = slow**2 * np.array([tuning.model.motor_lag, 1.0])
+
+
+def pull(model: Model, period: float) -> float:
+    """Share by which measured angles pull in a period those that are planned from; 1: these are the measured ones."""
+    return 1.0 if model.angles == "measured" else -math.expm1(-period / _FORGETTING)

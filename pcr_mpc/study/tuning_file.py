@@ -107,6 +107,8 @@ def _toml(tuning: Tuning, comments: Sequence[str]) -> str:
         f'linearise = "{model.linearise}"',
         f"payload = {str(model.payload).lower()}",
         f"predict_delay = {str(model.predict_delay).lower()}",
+        f'angles = "{model.angles}"',
+        f"motor_lag = {model.motor_lag:g}",
     ]
     if observer is not None:
         lines += [

@@ -74,6 +74,9 @@ static void write_parameters(pcr_controller *c)
     in[PCR_IN_HALF_STEP] = PCR_OBSERVER ? PCR_ANGLE_STEP / 2.0 : 0.0;
     in[PCR_IN_CARRIES] = PCR_OBSERVER;
     in[PCR_IN_DT] = PCR_PERIOD;
+    in[PCR_IN_PULL] = PCR_PULL;
+    in[PCR_IN_PRIOR] = PCR_PRIOR_LAG;
+    in[PCR_IN_PRIOR + 1] = PCR_PRIOR;
     for (int i = 0; i < PCR_N; i++) {
         in[PCR_IN_BOUNDS + i] = of->rate;
         in[PCR_IN_BOUNDS + PCR_N + i] = of->rate_change;
@@ -288,9 +291,10 @@ pcr_result pcr_controller_step(pcr_controller *c, const pcr_measurement *measure
         memcpy(foreseen, out + PCR_OUT_ARRIVING, sizeof foreseen);
     } else {
         if (!failed) {
-            memcpy(c->predicts, out + PCR_OUT_MODELS, sizeof c->predicts);
+            /* A plan of commanded angles has models and states of these. */
+            memcpy(c->predicts, out + (PCR_COMMANDED ? PCR_OUT_FIRST : PCR_OUT_MODELS), sizeof c->predicts);
         }
-        if (as_planned && !PCR_DELAY && c->has_states && !fallen) {
+        if (as_planned && !PCR_DELAY && !PCR_COMMANDED && c->has_states && !fallen) {
             memcpy(foreseen, c->states[1], sizeof foreseen);
         } else {
             predict(c->predicts, corrected, c->turning, foreseen);
