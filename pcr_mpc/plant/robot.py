@@ -142,8 +142,9 @@ class Robot(Frozen):
 
     def checked_angles(self, name: str, value: Any) -> np.ndarray:
         """Return motor angles as a float64 vector, shape (n,) [rad], or say what is wrong with them."""
-        q = checked_vector(name, value, self.n_rods)
-        if max(map(abs, q.tolist())) > _LARGEST_ANGLE:
+        q = checked_vector(name, value, len(self.rods))
+        angles = q.tolist()
+        if max(angles) > _LARGEST_ANGLE or min(angles) < -_LARGEST_ANGLE:
             raise ValueError(f"{name} is {q} rad, expected at most {_LARGEST_ANGLE:g} rad; take off the whole turns")
         return q
 
@@ -158,16 +159,21 @@ class Robot(Frozen):
 
     def slacks(self, p: np.ndarray) -> list[float]:
         """``1 - |p - base| / length`` of every rod: 0 where it is straight, negative out of reach."""
-        x, y = map(float, p)
-        return [1.0 - math.hypot(x - rod.base[0], y - rod.base[1]) / rod.length for rod in self.rods]
+        x, y = p.tolist()
+        return [1.0 - math.hypot(x - x_base, y - y_base) / length for x_base, y_base, length, _ in self._reach]
+
+    @cached_property
+    def _reach(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Base, length and least slack of every rod."""
+        return tuple((*rod.base, rod.length, -_LARGEST_STRAIN if rod.stretches else _LEAST_SLACK) for rod in self.rods)
 
     def require_reachable(self, p: np.ndarray) -> None:
         """Raise `UnreachableError` if some rod cannot reach ``p``, shape (2,) [m], or is straight there."""
-        for i, slack in enumerate(self.slacks(p)):
-            least = -_LARGEST_STRAIN if self.rods[i].stretches else _LEAST_SLACK
+        x, y = p.tolist()
+        for i, (x_base, y_base, length, least) in enumerate(self._reach):
+            slack = 1.0 - math.hypot(x - x_base, y - y_base) / length
             # Written so that NaN is out of reach.
             if not slack >= least:
-                length = self.rods[i].length
                 distance = length * (1.0 - slack)
                 advice = (
                     "straight, it has no definite force; move the tip closer to its base"

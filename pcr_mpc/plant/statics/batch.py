@@ -133,9 +133,11 @@ class _Work:
             "drift": (),
             "unknowns": (n, widths[way.method]),
         }
-        self.arrays = {name: np.full((count, *shape), np.nan) for name, shape in shapes.items()}
+        self.arrays = {name: np.empty((count, *shape)) for name, shape in shapes.items()}
+        self.arrays["residual_norm"][:] = np.nan  # a row that is still to be solved
         self.unstable = np.zeros((count, n), dtype=bool)
-        self.records = np.full((count, record_size(widths[way.method], n)), np.nan)
+        self.records = np.empty((count, record_size(widths[way.method], n)))
+        self._recorded = np.zeros(count, dtype=bool)
         self.reasons = [""] * count
         self._wanted = np.full(count, np.inf)  # drift
         self._kind = Kind(n, robot_layout(robot))
@@ -143,6 +145,12 @@ class _Work:
 
     def result(self) -> Equilibria:
         """All rows."""
+        unsolved = np.isnan(self.arrays["residual_norm"])
+        if unsolved.any():
+            for array in self.arrays.values():
+                array[unsolved] = np.nan
+        if not self._recorded.all():
+            self.records[~self._recorded] = np.nan
         return Equilibria(
             self.robot,
             self.p,
@@ -178,7 +186,7 @@ class _Work:
         self.arrays["unknowns"][row] = unknowns
         self.unstable[row, list(eq.unstable_rods)] = True
         if eq.record is not None:
-            self.records[row] = eq.record
+            self.records[row], self._recorded[row] = eq.record, True
         return eq
 
     def by_graphs(self, solver: RodSolver, guess: Equilibrium | None, *, along: bool) -> None:
@@ -205,9 +213,11 @@ class _Work:
 
     def _fit(self) -> np.ndarray:
         """Whether rows are for graphs, and need no checks of their own; sets how exact they are to be."""
-        slack = [1 - np.linalg.norm(self.p - rod.base, axis=1) / rod.length for rod in self.robot.rods]
+        fit, (x, y) = np.ones(len(self.p), dtype=bool), self.p.T
         # Written so that NaN is not fit.
-        fit = (np.abs(self.q).max(axis=1) < _LARGE) & (np.min(slack, axis=0) > _DOUBTFUL)
+        for rod, angles in zip(self.robot.rods, self.q.T, strict=True):
+            fit &= np.abs(angles) < _LARGE
+            fit &= 1 - np.hypot(x - rod.base[0], y - rod.base[1]) / rod.length > _DOUBTFUL
         if self.way.refined:
             self._wanted[fit] = [self.way.wanted_drift(self.robot, p) for p in self.p[fit]]
         return np.asarray(fit)
@@ -240,8 +250,8 @@ class _Work:
                 self._take(slice(row, row + done), records[:done], verdict[:done], results[:done])
                 i, pose = done - 1, np.concatenate((self.p[row + done - 1], self.q[row + done - 1]))
                 residual, drift = float(verdict[i, 0]), float(verdict[i, 4])
-                found = Climbed(records[i], results[i], residual, drift, method.settling)
-                last = solver.first.equilibrium(pose, found)
+                found = Climbed(pose, records[i], results[i], residual, drift, method.settling)
+                last = solver.first.equilibrium(found)
             row += done
             if done < size:
                 last = self.alone(row, last) or last
@@ -297,7 +307,7 @@ class _Work:
         scalars = records[:, -5 * n :].reshape(count, n, 5)
         load_tangents = records[:, -14 * n : -5 * n].reshape(count, n, 3, 3)  # of a rod: by column, that is by pose
         loads = records[:, -17 * n : -14 * n].reshape(count, n, 3)
-        self.records[rows] = records
+        self.records[rows], self._recorded[rows] = records, True
         to["unknowns"][rows] = records[:, : to["unknowns"][0].size].reshape(count, n, -1)
         to["force"][rows] = results[:, :2]
         to["dforce_dp"][rows] = results[:, 2:6].reshape(count, 2, 2).transpose(0, 2, 1)
@@ -329,6 +339,8 @@ def _many_graph(kind: Kind, method: RodMethod, count: int, along: bool, compiled
     if not along:
         return ca.Function("pose", [start, target, numbers], found).map("poses", "serial", count, [2], [])
     step = ca.Function("pose", [start, target, numbers], [found[0][: start.numel()], *found])
+    if warm.is_a("SXFunction"):
+        step = step.expand()
     many = step.mapaccum("poses", count, 1, {})
     targets = ca.MX.sym("targets", target.numel(), count)
     return ca.Function("path", [start, targets, numbers], many(start, targets, ca.repmat(numbers, 1, count)))

@@ -19,8 +19,9 @@ ROUGH = 1e-4
 
 
 class Climbed(NamedTuple):
-    """Record and result are those of the graph, and valid until the next climb (see `warm_calls`)."""
+    """Pose [p, q], record and result are those of the graph, and valid until the next climb (see `warm_calls`)."""
 
+    pose: np.ndarray
     record: np.ndarray
     result: np.ndarray
     residual: float
@@ -41,13 +42,15 @@ class FirstRung:
         self.robot, self.method = robot, method
         self._kind = Kind(robot.n_rods, method.layout)
         self._graphs = {iterations: self._graph(iterations) for iterations in (1, 2)}
-        self._start_size = len(self._graphs[1].inputs[1])
+        self._start_size = len(self._graphs[1][-1])
         self._record_size = record_size(method.newton.size1_in(0), robot.n_rods)
 
-    def _graph(self, iterations: int) -> BufferedFunction:
+    def _graph(self, iterations: int) -> tuple[BufferedFunction, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Graph, and of its inputs the pose, the tip and the angles in it, and the start."""
         graph = BufferedFunction(warm_step(self._kind, self.method, iterations))
-        graph.inputs[2][:] = self._kind.pack(self.robot)
-        return graph
+        pose, start, numbers = graph.inputs
+        numbers[:] = self._kind.pack(self.robot)
+        return graph, pose, pose[:2], pose[2:], start
 
     def knows(self, guess: Equilibrium) -> bool:
         """Whether an equilibrium has a record that the graphs can start from."""
@@ -67,9 +70,8 @@ class FirstRung:
         solved = self.method.tolerance if derivatives is None else self.method.following
         changed, done = 0.0, 0
         for iterations in (first, 1):
-            graph = self._graphs[iterations]
-            target, start, _ = graph.inputs
-            target[:2], target[2:], start[:] = p, q, record[: self._start_size]
+            graph, pose, tip, angles, start = self._graphs[iterations]
+            tip[:], angles[:], start[:] = p, q, record[: self._start_size]
             graph()
             record, verdict, result = graph.outputs
             residual, at_derivatives, change, conjugate_points, drift = verdict.tolist()
@@ -79,29 +81,32 @@ class FirstRung:
             if not (residual <= ROUGH and changed <= BRANCH_CHANGE and not conjugate_points):
                 return None
             if residual <= solved and at_derivatives <= (solved if derivatives is None else derivatives):
-                return Climbed(record, result, residual, drift, done)
+                return Climbed(pose, record, result, residual, drift, done)
         return None
 
     def near(self, guess: Equilibrium, p: np.ndarray, q: np.ndarray) -> Equilibrium | None:
         """Solve at (p, q), to rounding, from an equilibrium that it knows; None if the rods do not follow so."""
-        assert guess.record is not None
-        iterations = self.method.settling
+        record, iterations = guess.record, self.method.settling
+        assert record is not None
         if iterations not in self._graphs:
             self._graphs[iterations] = self._graph(iterations)
-        found = self._climb(guess.record, p, q, iterations, None)
-        return None if found is None else self.equilibrium(np.concatenate((p, q)), found)
+        found = self._climb(record, p, q, iterations, None)
+        return None if found is None else self.equilibrium(found)
 
-    def equilibrium(self, pose: np.ndarray, found: Climbed) -> Equilibrium:
-        """Keep what was found at a pose [p, q]."""
+    def equilibrium(self, found: Climbed) -> Equilibrium:
+        """Keep what was found."""
+        pose, record, result, residual, drift, iterations = found
         return Equilibrium.of_record(
-            self.robot,
-            pose,
-            self.method.name,
-            found.record.copy(),
-            found.result.copy(),
-            residual_norm=found.residual,
-            iterations=found.iterations,
-            rung="warm",
-            drift=found.drift,
-            unstable_rods=(),
+            pose.copy(),
+            record.copy(),
+            result.copy(),
+            {
+                "robot": self.robot,
+                "method": self.method.name,
+                "residual_norm": residual,
+                "iterations": iterations,
+                "rung": "warm",
+                "drift": drift,
+                "unstable_rods": (),
+            },
         )

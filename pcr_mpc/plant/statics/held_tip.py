@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -170,6 +171,14 @@ class Way(NamedTuple):
 def chosen_way(robot: Robot, method: str | None, segments: int, steps: int | None, scheme: str) -> Way:
     """Return the way that the arguments of `solve_statics` choose, or raise ValueError."""
     method = method or default_method(robot)
+    try:
+        return _way(method, segments, steps, scheme)
+    except TypeError:  # what cannot be hashed is refused in words of its own
+        return _way.__wrapped__(method, segments, steps, scheme)
+
+
+@lru_cache(maxsize=32, typed=True)
+def _way(method: str, segments: int, steps: int | None, scheme: str) -> Way:
     refined = steps is None and method in _WANTED_DRIFT
     shooting = checked_shooting(segments, 1 if steps is None else steps, scheme)
     return Way(method, replace(shooting, scheme="rk8") if refined and scheme != "rk8" else shooting, refined)

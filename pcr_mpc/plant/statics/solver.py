@@ -144,7 +144,7 @@ class RodSolver:
         self._snaps_before = len(self.snaps)
         found = self.first.climb(state.start, p, q, derivatives)
         if found is not None:
-            record, result, residual, drift, iterations = found
+            _, record, result, residual, drift, iterations = found
             self.adopt(record, result, drift=drift, residual=residual, iterations=iterations)
             self.rungs["warm"] += 1
             return
@@ -228,16 +228,18 @@ class RodSolver:
         """Everything about the last pose, which was solved at (p, q)."""
         state = self.state
         return Equilibrium.of_record(
-            self.robot,
             np.concatenate([p, q]),
-            self.method.name,
             state.record.copy(),
             state.result.copy(),
-            residual_norm=float(state.residual),
-            iterations=state.iterations,
-            rung=state.rung,
-            drift=state.drift,
-            unstable_rods=state.unstable_rods,
+            {
+                "robot": self.robot,
+                "method": self.method.name,
+                "residual_norm": float(state.residual),
+                "iterations": state.iterations,
+                "rung": state.rung,
+                "drift": state.drift,
+                "unstable_rods": state.unstable_rods,
+            },
         )
 
     @property
