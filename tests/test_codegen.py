@@ -17,7 +17,7 @@ from pcr_mpc.codegen.scope import check_scope
 from pcr_mpc.codegen.subject import Subject
 from pcr_mpc.errors import GenerationError, PCRError
 from pcr_mpc.loop.make_controller import make_controller
-from pcr_mpc.loop.scene import load_scene
+from pcr_mpc.loop.scene_file import load_scene
 
 from .conftest import ROOT
 
