@@ -23,8 +23,8 @@ from .held_tip import Way, chosen_way, solver_of
 from .solver import RodSolver
 from .state import columns, record_size
 
-# Poses in one call of a graph: each size is built once.
-_SIZES, _GROWTH = (512, 64, 8, 1), 8
+# Poses in one call of a graph: each size is built once, and any number of poses takes few calls.
+_SIZES, _GROWTH = tuple(2**k for k in range(9, -1, -1)), 8
 # Angle and slack beyond which the checks for one pose are asked, with their rounding and their words.
 _LARGE, _DOUBTFUL = 1e5, 1e-6
 
@@ -324,12 +324,12 @@ def _record(eq: Equilibrium) -> np.ndarray:
     return eq.record
 
 
-@per_thread(maxsize=16)
+@per_thread(maxsize=32)
 def _many(kind: Kind, method: RodMethod, count: int, along: bool, compiled: bool) -> BufferedFunction:
     return BufferedFunction(_many_graph(kind, method, count, along, compiled))
 
 
-@graph_cache(maxsize=16)
+@graph_cache(maxsize=32)
 def _many_graph(kind: Kind, method: RodMethod, count: int, along: bool, compiled: bool) -> Any:
     """(start or starts, targets, numbers) -> (last start of a path,) records, verdicts, results of ``count`` poses."""
     warm = warm_step(kind, method, method.settling)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from ...compiled import has_compiler
 from ...errors import ConvergenceError
 from ...plant.statics.batch import solve_statics_batch
 from ...plant.statics.equilibria import Equilibria
@@ -44,11 +45,12 @@ class Angles:
 
 def followed(pose: Equilibrium, p: np.ndarray, q: np.ndarray, near: Equilibria | None) -> Equilibria:
     """Held poses at many points, from poses near them, or where these do not lead there along the path from a pose."""
+    compiled = has_compiler()
     if near is not None:
-        poses = solve_statics_batch(pose.robot, p, q, guess=near)
+        poses = solve_statics_batch(pose.robot, p, q, guess=near, compiled=compiled)
         if poses.solved.all():
             return poses
-    return solve_statics_batch(pose.robot, p, q, guess=pose, along=True)
+    return solve_statics_batch(pose.robot, p, q, guess=pose, along=True, compiled=compiled)
 
 
 def balanced(
