@@ -1,4 +1,9 @@
 import os
+
+# Before numpy is loaded, here and in what inherits from here: every core has a worker of its own, and threads of small
+# matrices would wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import shlex
 import shutil
 from dataclasses import replace
