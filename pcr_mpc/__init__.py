@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         IdentificationError,
         InfeasibleError,
         LogError,
+        MarginsError,
         MeasurementError,
         ModelError,
         PCRError,
@@ -63,6 +64,8 @@ if TYPE_CHECKING:
     from .study.identification.identify import identify
     from .study.identification.log import Log, read_log
     from .study.identification.result import Identification
+    from .study.margins.measured import measure_delay_margin
+    from .study.margins.predicted import Margins, predict_delay_margin, predict_margins
     from .study.planning.limits import PlanLimits
     from .study.planning.plan import plan_timing
     from .study.planning.timed_path import TimedPath
@@ -92,6 +95,8 @@ __all__ = [
     "LinearModel",
     "Log",
     "LogError",
+    "Margins",
+    "MarginsError",
     "Material",
     "MeasurementError",
     "ModelError",
@@ -144,10 +149,13 @@ __all__ = [
     "load_tuning",
     "load_uncertainty",
     "make_controller",
+    "measure_delay_margin",
     "plan_timing",
     "plot_equilibria",
     "plot_equilibrium",
     "plot_run",
+    "predict_delay_margin",
+    "predict_margins",
     "read_log",
     "rollout",
     "run_episode",
@@ -173,6 +181,7 @@ _WHERE = {
         "IdentificationError",
         "InfeasibleError",
         "LogError",
+        "MarginsError",
         "MeasurementError",
         "ModelError",
         "PCRError",
@@ -216,6 +225,8 @@ _WHERE = {
     "study.identification.identify": ("identify",),
     "study.identification.log": ("Log", "read_log"),
     "study.identification.result": ("Identification",),
+    "study.margins.measured": ("measure_delay_margin",),
+    "study.margins.predicted": ("Margins", "predict_delay_margin", "predict_margins"),
     "study.planning.limits": ("PlanLimits",),
     "study.planning.plan": ("plan_timing",),
     "study.planning.timed_path": ("TimedPath",),

@@ -99,6 +99,10 @@ class IdentificationError(PCRError, ValueError):
     """A robot's numbers cannot be found as asked, or the best that there are do not explain what was recorded."""
 
 
+class MarginsError(PCRError, ValueError):
+    """A loop has no margins that can be told: it has no reference, or no law that is linear."""
+
+
 class OutputError(PCRError):
     """A file cannot be written, or is somebody's work and is left alone: ``path``."""
 

@@ -1,0 +1,1 @@
+"""How far a closed loop is from instability: predicted from its linear model, and measured in the nonlinear one."""

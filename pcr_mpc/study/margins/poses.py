@@ -1,0 +1,155 @@
+"""Linear closed loops about poses along a scene's reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...control.laws import Law
+from ...control.tuning import Tuning
+from ...errors import MarginsError, PCRError
+from ...linearisation.linear_model import LinearModel
+from ...linearisation.linearise import linearise
+from ...loop.feed_forward import feed_forward
+from ...loop.parts import make_law, make_model, make_observer, motor_limits
+from ...loop.scene import Scene
+from ...plant.motion.plant import DERIVATIVE_ACCURACY, Plant
+from ...plant.robot import Robot
+from ...plant.statics.equilibrium import Equilibrium
+from .linear_controller import Believed, Feedback, feedback_of, linear_controller
+from .linear_loop import LinearLoop
+from .linear_plant import Sampled, linear_plant
+
+LINEAR_LAWS = ("linear_mpc", "lqr", "pd")
+
+
+@dataclass(frozen=True, eq=False)
+class PoseOfReference:
+    """Where a reference is at a time, and what the controller does there.
+
+    Attributes
+    ----------
+    t : float
+        [s].
+    x : ndarray, shape (4 + n,)
+        State of the reference.
+    pose : Equilibrium
+        Of the rods of the robot that moves.
+    payload : float
+        [kg].
+    controller : Sampled
+    """
+
+    t: float
+    x: np.ndarray
+    pose: Equilibrium
+    payload: float
+    controller: Sampled
+
+
+class LinearLoops:
+    """The linear closed loops of a scene with a tuning, for the robot as it is believed to be or for another one.
+
+    Parameters
+    ----------
+    scene : Scene
+    tuning : Tuning, optional
+        Instead of the scene's own.
+    poses : int
+        How many, at equal times.
+
+    Attributes
+    ----------
+    scene : Scene
+        With the tuning, and its period.
+    poses : list of PoseOfReference
+
+    Raises
+    ------
+    MarginsError
+        There is nothing to analyse: no reference, or a law that is not linear or has no feedback; or the reference
+        passes poses without a linear model.
+    """
+
+    def __init__(self, scene: Scene, tuning: Tuning | None = None, *, poses: int = 24) -> None:
+        tuning = tuning or scene.tuning
+        if scene.trajectory is None or tuning is None:
+            raise MarginsError(
+                f"scene {scene.name} has no reference, so that no loop is closed: the motors stay where they are; give "
+                "it a [reference] and a control.tuning"
+            )
+        if tuning.law not in LINEAR_LAWS:
+            why = {"nonlinear_mpc": "is no linear law, and has no gain", "feed_forward": "measures nothing"}
+            raise MarginsError(
+                f"tuning {tuning.name}, law {tuning.law}: it {why[tuning.law]}; laws with margins are "
+                f"{', '.join(LINEAR_LAWS)}"
+            )
+        self.scene = scene = scene.tuned(tuning)
+        self.tuning = tuning
+        try:
+            self.poses = self._along(poses)
+        except (PCRError, ValueError) as error:
+            raise MarginsError(
+                f"scene {scene.name} with tuning {tuning.name}: no linear loop along the reference: {error}"
+            ) from error
+
+    def _along(self, count: int) -> list[PoseOfReference]:
+        scene, tuning = self.scene, self.tuning
+        robot, period, start = scene.robot, scene.period, scene.start()
+        n = robot.n_rods
+        known = scene if tuning.model.payload else replace(scene, payload=None)
+        reference = feed_forward(known, robot, start, 0, tuning.model.inertia)
+        model, target, real = make_model(robot, tuning.model), Plant(robot), self._plant(robot)
+        rest = np.concatenate([start.p, np.zeros(2), start.q])
+        for plant in (model, target, real):
+            plant.reset(rest, start)
+        resting = linearise(model, rest, np.zeros(n), period)
+        limits, observer = motor_limits(robot, period), make_observer(scene, tuning, resting)
+        law: Law = make_law(scene, tuning, robot, limits, start, lambda p, q, force: q)
+        law.prepare(resting)
+        delay = scene.delay if tuning.model.predict_delay else 0
+        found = []
+        for k in sorted({round(k) for k in np.linspace(0, scene.n_periods - 1, count).tolist()}):
+            x, t = reference.states[k], k * period
+            payload = float(scene.carried(np.array([t]))[0])
+            if payload and tuning.model.payload:
+                model.carry(payload, x)
+            there: LinearModel = linearise(model, x, np.zeros(n), period)
+            _, stiffness, by_angle = target.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
+            believed = Believed(there, stiffness.copy(), by_angle.copy(), None if observer is None else observer.gain,
+                                delay)  # fmt: skip
+            feedback: Feedback = feedback_of(law, believed, limits, resting)
+            found.append(
+                PoseOfReference(t, x.copy(), real.equilibrium(x), payload, linear_controller(believed, feedback))
+            )
+        return found
+
+    def _plant(self, robot: Robot) -> Plant:
+        settings = self.scene.plant
+        if settings.inertia == "full":  # modes of the rods, above what a controller reaches
+            settings = replace(settings, inertia="condensed", integrator="rk4")
+        return settings.make(robot)
+
+    def at(self, pose: PoseOfReference, robot: Robot | None = None) -> LinearLoop:
+        """The loop about a pose; of another robot, which the controller does not know."""
+        scene = self.scene
+        plant = self._plant(robot or scene.robot)
+        plant.reset(pose.x, pose.pose)
+        if pose.payload and scene.plant.payload == "carried":
+            plant.carry(pose.payload, pose.x)
+        lag = 0.0 if scene.motors is None else scene.motors.time_constant
+        return LinearLoop(
+            pose.t, pose.x[:2].copy(), linear_plant(plant, pose.x), pose.controller, scene.period,
+            scene.delay * scene.period + scene.untold_delay, lag,
+        )  # fmt: skip
+
+    def all(self) -> list[LinearLoop]:
+        """The loops about all poses."""
+        return [self.at(pose) for pose in self.poses]
+
+
+def scaled(robot: Robot, *, stiffness: float = 1.0, mass: float = 1.0) -> Robot:
+    """Return a robot whose EI of all rods and whose tip mass are so many times larger."""
+    rods = tuple(replace(rod, bending_stiffness=stiffness * rod.bending_stiffness) for rod in robot.rods)
+    return replace(robot, rods=rods, tip_mass=mass * robot.tip_mass)

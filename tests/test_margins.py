@@ -1,0 +1,155 @@
+"""The linear loop against the nonlinear simulation, and its margins against what they mean."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcr_mpc import load_scene, load_tuning, make_controller, simulate
+from pcr_mpc.errors import MarginsError
+from pcr_mpc.loop.hardware.motors import Motors
+from pcr_mpc.loop.trajectory import Hold
+from pcr_mpc.study.margins.linear_loop import LinearLoop
+from pcr_mpc.study.margins.measured import held_scene, measure_delay_margin, push_dies_away
+from pcr_mpc.study.margins.poses import LinearLoops, scaled
+from pcr_mpc.study.margins.predicted import _classical, delay_margin, predict_delay_margin
+
+from .conftest import CONTROLLERS, MODELS
+
+TIP = (0.04, 0.27)
+PUSH = np.array([0.8, -0.6])
+
+
+@pytest.fixture(scope="module")
+def lemniscate():
+    return load_scene(MODELS / "scenes" / "lemniscate.toml")
+
+
+def tuning_of(name):
+    # DAQP solves to rounding: OSQP's tolerance would drown a small perturbation.
+    tuning = load_tuning(CONTROLLERS / f"{name}.toml")
+    return replace(tuning, solver="daqp", horizon=min(tuning.horizon, 5))
+
+
+@pytest.fixture(scope="module")
+def holding(lemniscate):
+    """At rest off the centre, told one period of delay of 13.3 ms in all, motors that lag by 3 ms."""
+    plant = replace(lemniscate.plant, dt=5e-4)
+    return replace(lemniscate, duration=0.2, trajectory=Hold(TIP), start_tip=TIP, plant=plant, delay=1,
+                   untold_delay=0.0033, motors=Motors(time_constant=0.003))  # fmt: skip
+
+
+def deviations(scene, tuning, size):
+    """Of the tip and of the decided rates after a push, from the run without."""
+    scene = scene.tuned(tuning)
+    pushed = replace(scene, start_velocity=tuple((size * PUSH).tolist()))
+    runs = [simulate(each, each.make_plant(), make_controller(each)) for each in (pushed, scene)]
+    per = runs[0].steps_per_period
+    tips, rates = runs[0].x[::per, :2] - runs[1].x[::per, :2], runs[0].u - runs[1].u
+    return np.hstack([tips[: len(rates)], rates])
+
+
+def linear_response(loop: LinearLoop, size: float, count: int) -> np.ndarray:
+    closed = loop.closed()
+    state = np.zeros(len(closed.A))
+    state[2:4] = size * PUSH
+    found = []
+    for _ in range(count):
+        found.append(np.concatenate([state[:2], closed.C @ state]))
+        state = closed.A @ state
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", ["default", "lqr", "pd"])
+def test_the_linear_loop_is_the_loop_that_runs(holding, name):
+    """After a push tip and rates move as the linear loop says, and what is left falls with the square of the push."""
+    tuning = tuning_of(name)
+    loop = LinearLoops(holding, tuning, poses=1).all()[0]
+    misses = []
+    for size in (2e-3, 1e-3):
+        found = deviations(holding, tuning, size)
+        said = linear_response(loop, size, len(found))
+        misses.append(np.abs(found - said).max(axis=0) / np.abs(said).max(axis=0))
+    assert np.abs(said[-1]).max() < np.abs(said).max()
+    assert misses[1].max() < 6e-3
+    assert (misses[1] < 0.65 * misses[0] + 1e-3).all()
+
+
+def test_without_an_observer_too(holding):
+    tuning = replace(tuning_of("default"), observer=None)
+    loop = LinearLoops(holding, tuning, poses=1).all()[0]
+    found = deviations(holding, tuning, 1e-3)
+    said = linear_response(loop, 1e-3, len(found))
+    assert (np.abs(found - said).max(axis=0) < 6e-3 * np.abs(said).max(axis=0)).all()
+
+
+def test_another_robot_is_the_robot_that_moves(holding):
+    tuning = tuning_of("default")
+    other = scaled(holding.robot, stiffness=1.3, mass=1.2)
+    loops = LinearLoops(holding, tuning, poses=1)
+    loop = loops.at(loops.poses[0], other)
+    scene = holding.tuned(tuning)
+    runs = []
+    for size in (1e-3, 0.0):
+        true = replace(scene, robot=other, start_velocity=tuple((size * PUSH).tolist()))
+        runs.append(simulate(true, true.make_plant(), make_controller(scene)))
+    found = runs[0].u - runs[1].u
+    said = linear_response(loop, 1e-3, len(found))[:, 2:]
+    assert np.abs(found - said).max() < 6e-3 * np.abs(said).max()
+
+
+def test_at_a_margin_the_loop_neither_grows_nor_decays(holding):
+    """An eigenvalue has size 1 at the delay margin, and at the gain and the phase that python-control finds."""
+    loop = LinearLoops(replace(holding, untold_delay=0.0, motors=None), tuning_of("default"), poses=1).all()[0]
+    assert loop.later(delay_margin(loop)).spectral_radius() == pytest.approx(1.0, abs=3e-4)
+    frequencies = np.geomspace(1e-3, 0.999, 400) * 0.5 / loop.period
+    for motor, (gain, phase) in enumerate(_classical(loop, frequencies)):
+        closed = loop.closed()
+        out, into = closed.C[motor], closed.B[:, motor]
+        # Eigenvalues with the motor's rates multiplied by a gain, or turned by an angle.
+        for factor in (gain, np.exp(-1j * np.radians(phase))):
+            turned = closed.A + (factor - 1.0) * np.outer(into, out)
+            assert np.abs(np.linalg.eigvals(turned)).max() == pytest.approx(1.0, abs=2e-3)
+
+
+def test_a_delay_that_is_told_is_borne(lemniscate):
+    """Known, a period more costs a few milliseconds of margin; untold, all of the period."""
+    tuning = tuning_of("default")
+    margins = [predict_delay_margin(replace(lemniscate, **more), tuning, poses=2).value
+               for more in ({}, {"delay": 1}, {"untold_delay": 0.005})]  # fmt: skip
+    assert margins[0] > 0.01
+    assert margins[1] > margins[0] - 0.005
+    assert margins[2] == pytest.approx(margins[0] - 0.005, abs=2e-5)
+
+
+def test_three_motors_have_margins():
+    scene = load_scene(MODELS / "scenes" / "three_rods.toml")
+    assert 0.0 < predict_delay_margin(scene, poses=2).value < 0.3
+
+
+def test_what_has_no_margins_is_refused(lemniscate):
+    with pytest.raises(MarginsError, match="no gain"):
+        predict_delay_margin(lemniscate, load_tuning(CONTROLLERS / "nonlinear.toml"))
+    with pytest.raises(MarginsError, match="measures nothing"):
+        predict_delay_margin(lemniscate, load_tuning(CONTROLLERS / "open_loop.toml"))
+    with pytest.raises(MarginsError, match="no reference"):
+        predict_delay_margin(load_scene(MODELS / "scenes" / "release.toml"))
+
+
+def test_a_push_dies_away_below_the_margin_and_grows_above(lemniscate):
+    tuning = load_tuning(CONTROLLERS / "frozen.toml")
+    margin = predict_delay_margin(lemniscate, tuning, poses=4)
+    here = held_scene(lemniscate.tuned(tuning), margin.p)
+    assert push_dies_away(here, replace(here, untold_delay=0.93 * margin.value))
+    assert not push_dies_away(here, replace(here, untold_delay=1.1 * margin.value))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["frozen", "lqr"])
+def test_measured_and_predicted_delay_margins_agree(lemniscate, name):
+    tuning = load_tuning(CONTROLLERS / f"{name}.toml")
+    margin = predict_delay_margin(lemniscate, tuning, poses=24)
+    for p in (margin.p, None):
+        # From a bad guess, so that what is found is not what was said.
+        found = measure_delay_margin(lemniscate, tuning, p=p, guess=1.5 * margin.value)
+        assert found.value == pytest.approx(margin.value, rel=0.15)
