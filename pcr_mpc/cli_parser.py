@@ -27,6 +27,7 @@ examples:
   pcr-mpc generate lemniscate --out build/lemniscate       controller and plant as C
   pcr-mpc timing lemniscate                             step times against the real-time budgets
   pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
+  pcr-mpc margins lemniscate                            how much delay, lag and mismatch the loop bears
   pcr-mpc copy lemniscate mine                          a copy of that scene to change
   pcr-mpc new mine --diameter 1e-3 --length 0.5         a robot of your own to start from, in mine/
   pcr-mpc check mine/scene.toml                         what can be said of it without running it
@@ -37,7 +38,7 @@ Where a file is wanted, a name is one of pcr-mpc models; a path, such as ./mine/
 LINKS = 40
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 # Least values of the options that are whole numbers.
-LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8}
+LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8, "poses": 1}
 
 
 def tuning_or_class(text: str) -> Path | str:
@@ -219,6 +220,21 @@ def parser() -> argparse.ArgumentParser:
     timing.add_argument("--steps", type=int, default=100_000,
                         help="plant steps and control steps (default 100000: two or three minutes)")  # fmt: skip
     timing.add_argument("--out", type=Path, help="folder for the results (default results/timing/NAME)")
+
+    margins = command(
+        "margins",
+        "cli_margins",
+        "margins",
+        "Tell how far a scene's loop is from instability: how much more delay, motor lag, stiffness and mass it bears, "
+        "predicted by the linear closed loop along the reference and measured by bisection in the simulation.",
+    )
+    margins.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
+    margins.add_argument("--controller", type=Path, metavar="FILE|NAME",
+                         help="tuning instead of the scene's own: a file, or a name of pcr-mpc models")  # fmt: skip
+    margins.add_argument("--predicted", action="store_true", help="only predict: seconds instead of a minute or two")
+    margins.add_argument("--poses", type=int, default=24, help="of the reference, at equal times (default 24)")
+    margins.add_argument("--out", type=Path, help="folder for the results (default results/margins/SCENE_CONTROLLER)")
+    margins.add_argument("--no-pictures", action="store_true", help="write the figures only")
 
     tuning = command(
         "tune",

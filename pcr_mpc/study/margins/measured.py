@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ... import interrupt
 from ...control.tuning import Tuning
-from ...errors import MarginsError, SimulationError
+from ...errors import MarginsError, PCRError
 from ...loop.make_controller import make_controller
 from ...loop.run import Run
 from ...loop.scene import Scene
@@ -75,7 +75,7 @@ def push_dies_away(believed: Scene, true: Scene) -> bool:
     for each in (quiet, pushed):
         try:
             runs.append(simulate(each, each.make_plant(), make_controller(believed)))
-        except SimulationError as error:
+        except PCRError as error:  # a robot that is lost, or cannot stand at all
             interrupt.pass_on(error)
             return False
     tips = np.linalg.norm(runs[0].x[:, :2] - runs[1].x[:, :2], axis=1)

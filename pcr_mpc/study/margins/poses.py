@@ -150,6 +150,10 @@ class LinearLoops:
 
 
 def scaled(robot: Robot, *, stiffness: float = 1.0, mass: float = 1.0) -> Robot:
-    """Return a robot whose EI of all rods and whose tip mass are so many times larger."""
+    """Return a robot whose EI of all rods and whose tip mass are so many times larger.
+
+    Its motors have as much more torque, so that they hold the same poses.
+    """
     rods = tuple(replace(rod, bending_stiffness=stiffness * rod.bending_stiffness) for rod in robot.rods)
-    return replace(robot, rods=rods, tip_mass=mass * robot.tip_mass)
+    return replace(robot, rods=rods, tip_mass=mass * robot.tip_mass,
+                   torque_limit=stiffness * robot.torque_limit)  # fmt: skip

@@ -124,7 +124,20 @@ def delay_margin(loop: LinearLoop) -> float:
 
 
 def predict_delay_margin(scene: Scene, tuning: Tuning | None = None, *, poses: int = 9) -> Least:
-    """Least delay margin along a scene's reference [s], predicted: 0 where the loop is not stable as it is.
+    """Further delay that a loop bears, predicted by the linear closed loop where it is least along the reference.
+
+    Parameters
+    ----------
+    scene : Scene
+    tuning : Tuning, optional
+        Instead of the scene's own.
+    poses : int
+        At equal times along the reference.
+
+    Returns
+    -------
+    Least
+        [s]; 0 where the loop is not stable as it is.
 
     Raises
     ------
@@ -150,6 +163,10 @@ def predict_margins(scene: Scene, tuning: Tuning | None = None, *, poses: int = 
         Instead of the scene's own.
     poses : int
         At equal times along the reference.
+
+    Returns
+    -------
+    Margins
 
     Raises
     ------
