@@ -35,6 +35,7 @@ def _choices(scene: Scene, tuning: Tuning) -> list[tuple[str, Any, tuple[Any, ..
         ("law", tuning.law, ("linear_mpc",), other),
         ("solver", tuning.solver, ("osqp",), 'take solver = "osqp": its sources come with its wheel'),
         ("fallback", tuning.fallback, ("ladder",), other),
+        ("observer that adapts", tuning.observer.adapts if tuning.observer else (), ((),), "leave out observer.adapts"),
         ("learning", tuning.learning, (None,), "leave [learning] out of the tuning"),
         ("method of the controller's rods", model.method, ("closed_form",), other),
         ("reason to shoot", scene.robot.weightless().needs_shooting, (None,), "take a robot of plain rods"),

@@ -10,8 +10,11 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from ..buffered import BufferedFunction, graph_cache
-from ..errors import checked_number
+from ..errors import ModelError, checked_number
 from ..linearisation.linear_model import LinearModel
+
+# What may be estimated while the robot moves.
+ADAPTS = ("tip_mass", "stiffness")
 
 
 @dataclass(frozen=True)
@@ -26,14 +29,29 @@ class ObserverTuning:
         Of a force that acts for one period and is gone [N].
     force_walk : float
         Of the change of the unknown force from one period to the next [N].
+    adapts : tuple of {"tip_mass", "stiffness"}
+        Numbers of the robot that change slowly, or at once and seldom, and are estimated while it moves: the tip's mass
+        with what it carries; one factor for the stiffness of all rods. Motion shows their ratio only, so that of both
+        together each gets its share by how far it is believed to walk.
+    adapt_walk : float
+        Of their change from one period to the next, over what they are believed to be.
     """
 
     tip_noise: float = 1e-5
     force_noise: float = 0.01
     force_walk: float = 0.005
+    adapts: tuple[str, ...] = ()
+    adapt_walk: float = 0.005
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "adapts", tuple(self.adapts))
+        if unknown := [name for name in self.adapts if name not in ADAPTS]:
+            raise ModelError(f"adapts: {unknown[0]!r} is none of {', '.join(ADAPTS)}", key="observer.adapts")
+        if len(set(self.adapts)) < len(self.adapts):
+            raise ModelError(f"adapts names one twice: {', '.join(self.adapts)}", key="observer.adapts")
         for field in fields(self):
+            if field.name == "adapts":
+                continue
             object.__setattr__(self, field.name, checked_number(field.name, getattr(self, field.name), above=0.0))
 
 

@@ -323,6 +323,8 @@ def load_tuning(path: str | Path) -> Tuning:
             tip_noise=observer.number("tip_noise", ObserverTuning.tip_noise, above=0.0),
             force_noise=observer.number("force_noise", ObserverTuning.force_noise, above=0.0),
             force_walk=observer.number("force_walk", ObserverTuning.force_walk, above=0.0),
+            adapts=observer.texts("adapts") if observer.has("adapts") else (),
+            adapt_walk=observer.number("adapt_walk", ObserverTuning.adapt_walk, above=0.0),
         )
         law = file.text("law", LAWS[0], choices=LAWS)
         predicts, weighs = law.endswith("mpc"), law.endswith("mpc") or law == "lqr"

@@ -22,6 +22,7 @@ from ..linearisation.linear_model import LinearModel, LinearModels
 from ..linearisation.pose_limits import LimitWatch
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
+from .adaptation import Adaptation
 from .controllers import Decision
 from .foresight import Foresight, Outlook
 from .gate import Event, Gate
@@ -50,10 +51,10 @@ class ControlStep:
 
     Attributes
     ----------
-    law, foresight, observer, watch, track, learner, delay, fallback
+    law, foresight, observer, watch, track, learner, adaptation, delay, fallback
         Set, and set anew, by the controller between two steps: the control law, what looks ahead, the observer or None,
-        the limits of a pose, windows of the reference, what learns from its laps or None, the periods that are
-        predicted over, and whether a failure is raised.
+        the limits of a pose, windows of the reference, what learns from its laps or None, what adapts or None,
+        the periods that are predicted over, and whether a failure is raised.
     inverse : MotorTarget
     pose : Equilibrium
         In which the robot was last known to be.
@@ -81,6 +82,7 @@ class ControlStep:
         self._period, self._gate = period, gate
         self.observer: DisturbanceObserver | None = None
         self.learner: Learner | None = None
+        self.adaptation: Adaptation | None = None
         self.inverse = MotorTarget(robot)
         self.delay, self.k, self.believed = 0, -1, (True, True)
         self.u = self.turning = np.zeros(robot.n_rods)
@@ -108,6 +110,8 @@ class ControlStep:
         self._gate.start(pose.q)
         if self.learner is not None:
             self.learner.reset()
+        if self.adaptation is not None:
+            self.adaptation.reset()
         self._predicts = LinearModels.of([resting])
         rest = np.zeros(self.robot.n_rods)
         self.sent = deque([rest] * delay, maxlen=delay)
@@ -176,6 +180,8 @@ class ControlStep:
         began = time.perf_counter()
         foresight = self.foresight
         events = self._believe(k, x, foresight.inputs)
+        if self.adaptation is not None:
+            self.adaptation.correct(foresight, seen=self.believed[0])
         self._tell(k, foresight)
         failure, pose_limits, outlook = "", None, None
         try:
@@ -200,6 +206,8 @@ class ControlStep:
         self.on_the_way.append(u)
         arriving = self.turning = self.on_the_way.popleft()
         here = self._look_on(outlook, plan, estimate, arriving, foreseen=plan is decided and not self.delay)
+        if self.adaptation is not None:
+            self.adaptation.predict(self._predicts[0], estimate, here, force)
         known = foresight.inputs["estimate"]
         known[:-2], known[-2:] = here, force
         return Decision(u, plan, linearised - began, estimate, force, events)

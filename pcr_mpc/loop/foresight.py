@@ -16,6 +16,7 @@ from ..linearisation.linear_model import LinearModels
 from ..linearisation.linearise import linearise
 from ..plant.motion.plant import Plant
 from ..plant.motion.step_graph import StepModel
+from ..plant.rods.numbers import Kind
 from ..plant.statics.equilibrium import Equilibrium
 from .foresight_graph import Places, foresight_graph
 
@@ -163,6 +164,13 @@ class Foresight:
         assert model is not None
         assert target is not None
         return model, target
+
+    @property
+    def kinds(self) -> tuple[Kind, Kind]:
+        """What ``numbers`` and ``target_numbers`` of the inputs hold."""
+        assert self._plant.step_model is not None
+        assert self._target_plant.step_model is not None
+        return self._plant.step_model.kind, self._target_plant.step_model.kind
 
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
         """All rods are in ``pose``, and there is no force."""

@@ -26,6 +26,12 @@ class Track:
         Periods in a window.
     hold : callable
         () -> InverseDynamics of the end that is held, one row at least; called once, if it comes to that.
+
+    Attributes
+    ----------
+    reference : InverseDynamics
+    carries : bool
+        Whether there is any payload.
     """
 
     def __init__(
@@ -37,7 +43,7 @@ class Track:
         hold: Callable[[], InverseDynamics],
     ) -> None:
         self._rows, self._last, self._horizon, self._hold = _rows(reference), last, horizon, hold
-        self._payloads = payloads
+        self._payloads, self.reference = payloads, reference
         self.carries = bool(payloads.any())
         self._end: np.ndarray | None = None
 

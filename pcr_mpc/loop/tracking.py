@@ -18,6 +18,7 @@ from ..linearisation.linear_model import LinearModel
 from ..linearisation.pose_limits import LimitWatch
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
+from .adaptation import adapt
 from .control_step import ControlStep
 from .controllers import Decision
 from .feed_forward import InverseDynamics, feed_forward
@@ -167,6 +168,7 @@ class TrackingController(OnTheFly, Remade):
         work.law.reset()
         work.law.prepare(resting, work.watch.combinations())
         work.observer = make_observer(self._told, self.tuning, resting)
+        adapt(work, self.tuning, self._told, resting)
         work.restart(pose, resting, self._told.delay)
         write_constants(work.foresight, self.tuning, work.law, work.limits, work.observer)
 
@@ -228,6 +230,7 @@ class TrackingController(OnTheFly, Remade):
                 work.observer.start(here)
                 if observer is not None:
                     work.observer.force = observer.force
+        adapt(work, self.tuning, self._told, resting)
         if work.delay != len(work.on_the_way):
             work.on_the_way = deque(list(work.sent)[len(work.sent) - work.delay :])
         if tuning.law == old.law and not model_changed:

@@ -119,6 +119,12 @@ def _toml(tuning: Tuning, comments: Sequence[str]) -> str:
             _line("force_noise", observer.force_noise, "N, forces that come and go"),
             _line("force_walk", observer.force_walk, "N, change of the unknown force in a period"),
         ]
+        if observer.adapts:
+            named = ", ".join(f'"{name}"' for name in observer.adapts)
+            lines += [
+                f"{f'adapts = [{named}]':26}# estimated while the robot moves",
+                _line("adapt_walk", observer.adapt_walk, "relative change in a period"),
+            ]
     if tuning.learning is not None:
         lines += [
             "",
