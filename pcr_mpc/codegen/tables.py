@@ -105,6 +105,7 @@ def config(subject: Subject) -> str:
         "PCR_PLANT_MEMORY": sum(subject.plant.step_model.widths) if subject.plant.step_model else 0,
         "PCR_PLANT_MASSLESS": int(subject.plant.inertia == "none" and subject.plant.weight == "none"),
     }
+    values["PCR_PLANT_CONSTANT"] = int(subject.plant.inertia == "constant")
     values |= {f"PCR_{part.upper()}": size for part, size in rooms.items()}
     values |= {f"PCR_PLANT_{part.upper()}": size for part, size in plant_rooms.items()}
     values |= _offsets("PCR_IN", *_inputs(foresight)) | {"PCR_INS": foresight.n_in()}

@@ -98,15 +98,26 @@ pcr_result pcr_plant_carry(pcr_plant *plant, double payload)
     if (pcr_plant_status(plant) != PCR_OK) {
         return PCR_NOT_STARTED;
     }
-    if (!(payload >= 0.0 && isfinite(payload)) || !PCR_PLANT_MASSLESS) {
+    if (!(payload >= 0.0 && isfinite(payload)) || !(PCR_PLANT_MASSLESS || PCR_PLANT_CONSTANT)) {
         return PCR_ARGUMENT;
     }
-    double *mass = plant->numbers + PCR_TIP_MASS;
-    const double before = *mass;
+    /* M of the tip's motion [a, b; b, d], before and after; what is picked up was at rest, and momentum stays. */
+    double *mass = plant->numbers + PCR_TIP_MASS, a = *mass, b = 0.0, d = *mass;
+    const double before = plant->payload, change = payload - before;
     *mass = pcr_scene_plant_numbers[PCR_TIP_MASS] + payload;
-    if (payload > plant->payload) {
-        plant->x[2] *= before / *mass;
-        plant->x[3] *= before / *mass;
+    if (PCR_PLANT_CONSTANT) {
+        double *matrix = plant->memory + PCR_LOADS + 2;
+        a = matrix[0];
+        b = matrix[1];
+        d = matrix[3 + PCR_N];
+        matrix[0] += change;
+        matrix[3 + PCR_N] += change;
+    }
+    if (change > 0.0) {
+        const double px = a * plant->x[2] + b * plant->x[3], py = b * plant->x[2] + d * plant->x[3];
+        const double determinant = (a + change) * (d + change) - b * b;
+        plant->x[2] = ((d + change) * px - b * py) / determinant;
+        plant->x[3] = ((a + change) * py - b * px) / determinant;
     }
     plant->payload = payload;
     return PCR_OK;
