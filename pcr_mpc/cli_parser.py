@@ -25,6 +25,7 @@ examples:
   pcr-mpc identify lemniscate run.csv --out mine.toml   a robot's numbers from recorded motion
   pcr-mpc excite lemniscate --duration 6                a motion worth recording
   pcr-mpc generate lemniscate --out build/lemniscate       controller and plant as C
+  pcr-mpc hil lemniscate                                in real time, the controller over a wire
   pcr-mpc timing lemniscate                             step times against the real-time budgets
   pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
   pcr-mpc margins lemniscate                            how much delay, lag and mismatch the loop bears
@@ -38,7 +39,11 @@ Where a file is wanted, a name is one of pcr-mpc models; a path, such as ./mine/
 LINKS = 40
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 # Least values of the options that are whole numbers.
+<<<<<<< HEAD
 LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8, "poses": 1}
+=======
+LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8, "silence": 1}
+>>>>>>> 881b20a (The controller as a UDP server, and the loop in real time over loopback; whatever is no measurement moves no motor)
 
 
 def tuning_or_class(text: str) -> Path | str:
@@ -209,6 +214,34 @@ def parser() -> argparse.ArgumentParser:
                       "file, or a name of pcr-mpc models")  # fmt: skip
     code.add_argument("--solver", choices=("osqp", "daqp"), help="QP solver (default: the tuning's)")
     code.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default build/NAME)")
+
+    server = command(
+        "serve",
+        "cli_serve",
+        "serve",
+        "Serve a scene's controller over UDP: a measurement comes, motor rates go back. docs/wire.md has the packets. "
+        "Silence brings the motors to rest. Ctrl-C ends it.",
+    )
+    server.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
+    server.add_argument("--controller", type=Path, metavar="FILE|NAME", help="tuning instead of the scene's own")
+    server.add_argument("--listen", default="127.0.0.1:5005", metavar="HOST:PORT",
+                        help="where to (default 127.0.0.1:5005; port 0 takes a free one)")  # fmt: skip
+    server.add_argument("--anywhere", action="store_true", help="allow a host that is no loopback address: whoever can "
+                        "send there moves the motors")  # fmt: skip
+    server.add_argument("--silence", type=int, default=5, metavar="N", help="control periods without a measurement, "
+                        "after which the motors come to rest (default 5)")  # fmt: skip
+
+    loop = command(
+        "hil",
+        "cli_serve",
+        "hil",
+        "Run a scene in real time, the plant in one process and the controller in another, over UDP on loopback: "
+        "error, round trips, missed periods, as a table and a picture.",
+    )
+    loop.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
+    loop.add_argument("--controller", type=Path, metavar="FILE|NAME", help="tuning instead of the scene's own")
+    loop.add_argument("--duration", type=float, metavar="S", help="of the run [s] (default: the scene's)")
+    loop.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default results/hil/NAME)")
 
     timing = command(
         "timing",

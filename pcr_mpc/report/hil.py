@@ -1,0 +1,64 @@
+"""Table and picture of a loop that was closed over a wire."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..wire.hil import HilRun
+from .style import BLUE, GREY, ORANGE, RED, plt, save_figure
+from .tables import table
+
+
+def hil_table(summary: dict[str, Any]) -> str:
+    """Figures of a run."""
+    names = ("p50", "p95", "p99", "p99.9", "max")
+    rows = [
+        (label, *(f"{summary[key][name]:.0f}" if summary[key] else "-" for name in names))
+        for label, key in (("round trip", "round_trip_us"), ("plant step later than due", "plant_late_us"))
+    ]
+    server = ", ".join(f"{count} {name}" for name, count in summary["server"].items())
+    return "\n".join(
+        [
+            f"scene       {summary['scene']}, {summary['duration_s']:g} s in real time",
+            f"error       RMS {summary['rms_mm']:.5g} mm, at most {summary['max_mm']:.5g} mm",
+            f"simulated   RMS {summary['simulated_rms_mm']:.5g} mm, with commands {summary['simulated_delay_ms']:g} ms "
+            "later than told",
+            f"processes   with {summary['priority']} priority",
+            f"commands    {summary['missed']} of {summary['periods']} missed their period of "
+            f"{1e3 * summary['period_s']:g} ms, {summary['fallbacks']} by a lower rung",
+            f"server      {server}",
+            "",
+            table(("[us]", *names), rows),
+        ]
+    )
+
+
+def plot_hil(run: HilRun, path: Path) -> None:
+    """Draw the error, the round trips with those that were missed, and how late the plant's steps were."""
+    figure, (error, trips, late) = plt.subplots(3, 1, figsize=(9, 7.5), layout="constrained")
+    summary = run.summary()
+    error.plot(run.t, 1e3 * run.error, color=BLUE, lw=0.9)
+    error.axhline(summary["simulated_rms_mm"], color=ORANGE, ls="--", lw=1.0,
+                  label=f"simulated with commands {summary['simulated_delay_ms']:g} ms late: RMS "
+                  f"{summary['simulated_rms_mm']:.3g} mm")  # fmt: skip
+    error.set(xlim=(0.0, run.t[-1]), ylim=(0.0, None), xlabel="time [s]", ylabel="error of the tip [mm]")
+    error.set_title(f"{run.scene.name} over a wire: RMS {summary['rms_mm']:.3g} mm")
+    error.legend(loc="upper left")
+
+    t = run.scene.period * np.arange(len(run.round_trip))
+    missing = np.isnan(run.round_trip)
+    trips.semilogy(t, 1e3 * run.round_trip, ".", color=BLUE, ms=3, label="measurement to command")
+    trips.axhline(1e3 * run.scene.period, color=GREY, lw=1.0, label="control period")
+    if missing.any():
+        trips.plot(t[missing], np.full(missing.sum(), 1e3 * run.scene.period), "x", color=RED, ms=5,
+                   label=f"{missing.sum()} missed")  # fmt: skip
+    trips.set(xlim=(0.0, run.t[-1]), xlabel="time [s]", ylabel="round trip [ms]")
+    trips.legend(loc="upper right")
+
+    bins = np.logspace(0.0, max(1.0, np.log10(1e6 * max(run.late.max(), 1e-6))), 60)
+    late.hist(1e6 * np.maximum(run.late, 1e-6), bins=bins, color=BLUE)
+    late.set(xscale="log", yscale="log", xlabel="plant step later than due [us]", ylabel="steps")
+    save_figure(figure, path)

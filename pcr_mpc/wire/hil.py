@@ -1,0 +1,255 @@
+"""A plant in real time in this process, its controller in another one, and the loop closed over loopback."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from .. import interrupt
+from ..errors import PCRError, SimulationError
+from ..loop.make_controller import make_controller
+from ..loop.parts import resting_state
+from ..loop.scene import Scene
+from ..loop.simulate import simulate
+from .packet import RESTING, Measurement, command_size, pack_measurement, unpack_command
+
+_PATIENCE = 120.0  # s, until the controller's process listens
+_HEAD_START = 0.05  # s
+_SPIN = 1e-4  # s before a step is due, in which sleeping is too coarse
+
+
+@dataclass(frozen=True, eq=False)
+class HilRun:
+    """What was measured.
+
+    Attributes
+    ----------
+    scene : Scene
+    dt : float
+        Step of the plant [s].
+    t, error : ndarray, shape (K + 1,)
+        Times, and the tip's distance from the reference [s], [m].
+    late : ndarray, shape (K,)
+        How much later than due each plant step began [s].
+    round_trip : ndarray, shape (M,)
+        From a measurement to its command, as far as they came [s]; NaN for those that did not come within their period.
+    rungs : ndarray, shape (M,)
+        Of the commands, -1 for those that did not come.
+    simulated : float
+        RMS error of the simulated loop whose commands come later than told by the mean of what these did [m].
+    simulated_delay : float
+        That delay [s].
+    counts : dict
+        Of the server.
+    priority : {"real-time", "normal"}
+        With which both processes were scheduled.
+    """
+
+    scene: Scene
+    dt: float
+    t: np.ndarray
+    error: np.ndarray
+    late: np.ndarray
+    round_trip: np.ndarray
+    rungs: np.ndarray
+    simulated: float
+    simulated_delay: float
+    counts: dict[str, int]
+    priority: str
+
+    @property
+    def missed(self) -> int:
+        """Periods without a command."""
+        return int(np.isnan(self.round_trip).sum())
+
+    def summary(self) -> dict[str, Any]:
+        """Figures of the run, times in us."""
+        came = self.round_trip[~np.isnan(self.round_trip)]
+        rms = 1e3 * float(np.sqrt(np.mean(self.error**2)))
+        return {
+            "scene": self.scene.name,
+            "duration_s": float(self.t[-1]),
+            "period_s": self.scene.period,
+            "plant_step_s": self.dt,
+            "rms_mm": rms,
+            "max_mm": 1e3 * float(self.error.max()),
+            "simulated_rms_mm": 1e3 * self.simulated,
+            "simulated_delay_ms": 1e3 * self.simulated_delay,
+            "round_trip_us": _percentiles(came),
+            "plant_late_us": _percentiles(self.late),
+            "periods": len(self.round_trip),
+            "missed": self.missed,
+            "fallbacks": int((self.rungs > 0).sum()),
+            "priority": self.priority,
+            "server": self.counts,
+        }
+
+
+def _percentiles(times: np.ndarray) -> dict[str, float]:
+    """p50 to max [us]."""
+    if not len(times):
+        return {}
+    shares = {"p50": 50, "p95": 95, "p99": 99, "p99.9": 99.9, "max": 100}
+    return {name: 1e6 * float(np.percentile(times, share)) for name, share in shares.items()}
+
+
+def run_hil(scene: Scene, *, progress: bool = False) -> HilRun:
+    """Run a scene in real time, the controller behind UDP.
+
+    Raises
+    ------
+    PCRError
+        The controller's process does not come up.
+    SimulationError
+        The plant failed.
+    """
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_controller, args=(scene, theirs), daemon=True)
+    process.start()
+    try:
+        address = _expected(ours, process)
+        with _preferred() as priority:
+            plant_log = _plant(scene, address, progress=progress)
+        ours.send("end")
+        counts = _expected(ours, process)
+    finally:
+        if process.is_alive():
+            process.join(2.0)
+        if process.is_alive():
+            process.terminate()
+    t, error, late, round_trip, rungs, dt = plant_log
+    came = round_trip[~np.isnan(round_trip)]
+    # A command acts at the first step that begins after it has come, which is when it is seen.
+    delay = dt * float(np.mean(np.floor(came / dt))) if len(came) else 0.0
+    return HilRun(scene, dt, t, error, late, round_trip, rungs, _simulated(scene, delay), delay, counts, priority)
+
+
+@contextmanager
+def _preferred() -> Iterator[str]:
+    """Be scheduled before all that is not in real time, where that is allowed; says which priority it is."""
+    try:
+        before = os.sched_getscheduler(0)
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except (AttributeError, OSError):  # another system, or not allowed
+        yield "normal"
+        return
+    try:
+        yield "real-time"
+    finally:
+        os.sched_setscheduler(0, before, os.sched_param(0))
+
+
+def _expected(pipe: Connection, process: Any) -> Any:
+    for _ in range(int(_PATIENCE / 0.1)):
+        if pipe.poll(0.1):
+            found = pipe.recv()
+            if isinstance(found, BaseException):
+                raise found
+            return found
+        interrupt.check()
+        if not process.is_alive():
+            break
+    raise PCRError("the controller's process has ended or does not answer; try `pcr-mpc serve` to see why")
+
+
+def _controller(scene: Scene, pipe: Connection) -> None:
+    """The other process."""
+    from .decider import Decider
+    from .server import Server
+
+    try:
+        server = Server(Decider(scene), ("127.0.0.1", 0))
+    except Exception as error:  # whatever it is, who waits is told
+        pipe.send(error)
+        return
+    pipe.send(server.address)
+    with _preferred():
+        server.serve(lambda text: print(f"{scene.name}: {text}", file=sys.stderr), until=pipe.poll)
+    server.close()
+    pipe.send(dict(server.counts))
+
+
+def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[Any, ...]:
+    """Step the plant by the clock; commands act at the first step after they have come."""
+    pose, plant = scene.start(), scene.make_plant()
+    x = resting_state(pose)
+    plant.reset(x, pose)
+    per, n = round(scene.period / plant.dt), scene.robot.n_rods
+    count = scene.n_periods * per
+    t = plant.dt * np.arange(count + 1)
+    assert scene.trajectory is not None
+    wanted = scene.trajectory(t)[:, 0]
+    tips, late = np.empty((count + 1, 2)), np.empty(count)
+    sent = np.full(scene.n_periods, np.nan)
+    round_trip, rungs = np.full(scene.n_periods, np.nan), np.full(scene.n_periods, -1)
+    u, noise = np.zeros(n), np.random.default_rng(0)
+    tips[0] = x[:2]
+    plant.step(x, u)  # pays for building graphs before the clock runs
+    plant.reset(x, pose)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        wire.connect(address)
+        wire.setblocking(False)
+        bar = tqdm(total=scene.n_periods, desc=scene.name, unit="period", disable=not progress)
+        began = time.perf_counter() + _HEAD_START
+        for step in range(count):
+            due = began + step * plant.dt
+            _sleep_until(due)
+            late[step] = time.perf_counter() - due
+            if step % per == 0:
+                interrupt.check()
+                k = step // per
+                p = x[:2] + (noise.normal(0.0, scene.tip_noise, 2) if scene.tip_noise else 0.0)
+                q = scene.angle_step * np.round(x[4:] / scene.angle_step) if scene.angle_step else x[4:]
+                sent[k] = time.perf_counter()
+                _quietly(wire.send, pack_measurement(Measurement(k, t[step], p, q)))
+                bar.update()
+            while data := _quietly(wire.recv, command_size(n) + 1):
+                command = unpack_command(data, n)
+                if command is None or command.sequence >= len(sent):
+                    continue
+                u = command.u
+                taken = time.perf_counter() - sent[command.sequence]
+                if command.rung != RESTING and command.sequence == step // per and np.isnan(round_trip[step // per]):
+                    round_trip[step // per], rungs[step // per] = taken, command.rung
+            try:
+                x = plant.step(x, u, scene.force)
+            except PCRError as error:
+                raise SimulationError(
+                    f"{scene.name}: the plant failed at {t[step]:.3f} s: {error}", t=t[step]
+                ) from error
+            tips[step + 1] = x[:2]
+        bar.close()
+    return t, np.hypot(*(tips - wanted).T), late, round_trip, rungs, plant.dt
+
+
+def _sleep_until(due: float) -> None:
+    while (left := due - time.perf_counter()) > 0.0:
+        if left > _SPIN:
+            time.sleep(left - _SPIN)
+
+
+def _quietly(call: Any, *arguments: Any) -> Any:
+    """Result of a call of a socket that does not wait; None where there is nothing, or nobody there."""
+    try:
+        return call(*arguments)
+    except OSError:
+        return None
+
+
+def _simulated(scene: Scene, delay: float) -> float:
+    """RMS error of the simulated loop with commands that come so late [m]."""
+    late = replace(scene, untold_delay=delay)
+    run = simulate(late, late.make_plant(), make_controller(late), 0, spent=lambda k, measured: 0.0)
+    return 1e-3 * float(run.summary()["rms_mm"])
