@@ -39,11 +39,7 @@ Where a file is wanted, a name is one of pcr-mpc models; a path, such as ./mine/
 LINKS = 40
 _CLASS = re.compile(r".+:[A-Za-z_]\w*")
 # Least values of the options that are whole numbers.
-<<<<<<< HEAD
-LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8, "poses": 1}
-=======
-LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8, "silence": 1}
->>>>>>> 881b20a (The controller as a UDP server, and the loop in real time over loopback; whatever is no measurement moves no motor)
+LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8, "poses": 1, "silence": 1}
 
 
 def tuning_or_class(text: str) -> Path | str:

@@ -10,7 +10,8 @@ from pathlib import Path
 from .control.tuning import load_tuning
 from .errors import OutputError
 from .files import results, saved
-from .loop.scene import Scene, load_scene
+from .loop.scene import Scene
+from .loop.scene_file import load_scene
 
 
 def _scene(options: argparse.Namespace) -> Scene:

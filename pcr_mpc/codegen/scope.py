@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 from ..control.tuning import Tuning
 from ..errors import GenerationError
 from ..loop.scene import Scene
+
+# What of a scene, a tuning and its model C knows, or need not know; all else must be as it is by default.
+_KNOWN = {
+    "scene": "name robot duration start_tip start_motors start_mode start_velocity trajectory plant period tuning "
+    "force tip_noise angle_step delay deadline late pose_limits payload need finding own_period wrapped tracking_error "
+    "untold_delay motors",
+    "tuning": "name horizon position_weight velocity_weight angle_weight input_weight tolerance max_iterations "
+    "fallback model observer law pd period solver",
+    "model": "method segments steps scheme inertia linearise payload predict_delay compiled",
+}
 
 
 def check_scope(scene: Scene, tuning: Tuning | None) -> Tuning:
@@ -29,6 +40,12 @@ def check_scope(scene: Scene, tuning: Tuning | None) -> Tuning:
         if found not in known:
             named = ", ".join(map(str, known))
             raise GenerationError(f"{scene.name}: C has no {part} {found!r} yet, only {named}; {advice}", part=part)
+    for what, of in (("scene", scene), ("tuning", tuning), ("model", tuning.model)):
+        for field in fields(of):
+            value = getattr(of, field.name)
+            if field.name not in _KNOWN[what].split() and value != field.default:
+                raise GenerationError(f"{scene.name}: C does not know {field.name} of the {what} yet, which is "
+                                      f"{value!r}; leave it out", part=field.name)  # fmt: skip
     return tuning
 
 
