@@ -12,6 +12,7 @@ from typing import Any
 from . import interrupt
 from .errors import OutputError
 from .files import require_folder, require_free, results, saved
+from .loop.scene import Scene
 from .loop.scene_file import load_scene
 from .report.choice_tables import choice_record, choice_table
 from .report.csv_rows import write_rows
@@ -114,10 +115,19 @@ def tune_controller(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(record))
     elif chosen is None:
-        print(f"\nnone of {len(trials)} trials beats {search.start.name}: no tuning is written; see {folder}")
+        beaten = f"{search.start.name}{_enough(scene, trials)}"
+        print(f"\nnone of {len(trials)} trials beats {beaten}: no tuning is written; see {folder}")
     else:
         print(f"\n{tuning_table(search, chosen)}\n\nwritten to {path}; the study is in {folder}")
     return _ended("; ".join(filter(None, [*problems, problem])), folder)
+
+
+def _enough(scene: Scene, trials: list[dict[str, Any]]) -> str:
+    """What a scene needs beside a better score, and what came nearest."""
+    if scene.delay_margin is None:
+        return ""
+    most = max((row.get("delay_margin_ms", 0.0) for row in trials), default=0.0)
+    return f" with the delay margin of {1e3 * scene.delay_margin:g} ms that is needed (the largest is {most:.3g} ms)"
 
 
 def _ended(problem: str, folder: Path) -> int:

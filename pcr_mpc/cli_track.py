@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from dataclasses import replace
 from functools import partial
@@ -13,13 +14,15 @@ from typing import Any
 from . import interrupt
 from .cli_parser import LINKS
 from .control.tuning import Tuning, load_tuning
-from .errors import OutputError, PCRError, SimulationError
+from .errors import MarginsError, OutputError, PCRError, SimulationError
 from .files import require_folder, results, saved
 from .loop.controllers import Controller
+from .loop.feed_forward import InverseDynamics
 from .loop.make_controller import make_controller
 from .loop.model_inertia import by_model_inertia
 from .loop.own_controller import OwnController
 from .loop.run import RECORD, Run
+from .loop.scene import Scene
 from .loop.scene_file import load_scene
 from .loop.simulate import simulate
 from .loop.simulated_plant import SimulatedPlant
@@ -27,7 +30,9 @@ from .plant.mujoco.plant import MuJoCoPlant
 from .report.laps import plot_laps
 from .report.plots import animate_run, plot_run
 from .report.tables import summary_table
+from .study.margins.predicted import predict_delay_margin
 
+_MARGIN_POSES = 5  # a quarter of a second
 _PICTURES, _LEARNT = ("track.png", "track.gif"), ("laps.png",)
 
 
@@ -65,6 +70,8 @@ def track(options: argparse.Namespace) -> int:
     summary = run.summary()
     if options.plant and used is not None and failure is None:
         summary["by_model_inertia"] = by_model_inertia(run, used, plant, progress=True)
+    if used is not None and not interrupt.noted():
+        summary["delay_margin"] = _delay_margin(scene, used, getattr(controller, "reference", None))
     # Of a run that was interrupted the record is enough: who presses Ctrl-C wants no pictures.
     pictures = not (options.no_pictures or interrupt.noted())
     folder, second = saved(partial(_complete, run, summary, pictures), folder)
@@ -76,6 +83,17 @@ def track(options: argparse.Namespace) -> int:
     if problem or second:
         raise OutputError(problem or second, path=str(folder))
     return 0
+
+
+def _delay_margin(scene: Scene, tuning: Tuning, reference: InverseDynamics | None) -> dict[str, Any] | None:
+    """What the loop bears and what the scene needs; None where there is nothing to predict."""
+    try:
+        least = predict_delay_margin(scene, tuning, poses=_MARGIN_POSES, reference=reference)
+    except MarginsError:
+        return None
+    needed = None if scene.delay_margin is None else 1e3 * scene.delay_margin
+    predicted = 1e3 * least.value if math.isfinite(least.value) else None
+    return {"predicted_ms": predicted, "t_s": least.t, "p_m": list(least.p), "needed_ms": needed}
 
 
 def _complete(run: Run, summary: dict[str, Any], pictures: bool, folder: Path) -> None:

@@ -83,6 +83,16 @@ def test_without_an_observer_too(holding):
     assert (np.abs(found - said).max(axis=0) < 6e-3 * np.abs(said).max(axis=0)).all()
 
 
+def test_from_commanded_angles_too(holding):
+    """With a lag that angles which are planned from do not show."""
+    tuning = tuning_of("default")
+    tuning = replace(tuning, model=replace(tuning.model, angles="commanded"))
+    loop = LinearLoops(holding, tuning, poses=1).all()[0]
+    found = deviations(holding, tuning, 1e-3)
+    said = linear_response(loop, 1e-3, len(found))
+    assert (np.abs(found - said).max(axis=0) < 6e-3 * np.abs(said).max(axis=0)).all()
+
+
 def test_another_robot_is_the_robot_that_moves(holding):
     tuning = tuning_of("default")
     other = scaled(holding.robot, stiffness=1.3, mass=1.2)

@@ -81,6 +81,8 @@ class Scene:
         Distance of the tip from the reference beyond which a run counts as lost [m]. None: a tenth of the shortest rod.
     motors : Motors or None
         How the motors follow their commands, which no controller is told. None: at once.
+    delay_margin : float or None
+        Further delay that the loop of a tuning must bear [s] (see `predict_delay_margin`). None: nothing is asked.
     """
 
     name: str
@@ -109,6 +111,7 @@ class Scene:
     tracking_error: float | None = None
     untold_delay: float = 0.0
     motors: Motors | None = None
+    delay_margin: float | None = None
 
     @property
     def allowed_error(self) -> float:

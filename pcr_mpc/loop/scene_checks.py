@@ -39,6 +39,8 @@ def check_scene(scene: Any) -> None:
     )  # fmt: skip
     if scene.own_period is not None:
         check_numbers(scene, {"own_period": {"above": 0.0}})
+    if scene.delay_margin is not None:
+        check_numbers(scene, {"delay_margin": {"above": 0.0}})
     if scene.deadline != math.inf:
         check_numbers(scene, {"deadline": {"minimum": 0.0}})
     if isinstance(scene.delay, bool) or not hasattr(scene.delay, "__index__") or scene.delay < 0:

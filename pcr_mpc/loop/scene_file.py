@@ -77,12 +77,12 @@ def load_scene(path: str | Path) -> Scene:
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
             wrapped = sensor.boolean("wrapped", False)
         payload = read_payload(file)
-        need, finding, moved_by = read_need(file), read_finding(file), read_motors(file)
+        (need, margin), finding, moved_by = read_need(file), read_finding(file), read_motors(file)
         scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                       tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
                       delay, deadline, late, pose_limits, payload, need, finding,
                       wrapped=wrapped, tracking_error=tracking_error, untold_delay=untold_delay,
-                      motors=moved_by)  # fmt: skip
+                      motors=moved_by, delay_margin=margin)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

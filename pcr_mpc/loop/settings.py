@@ -22,6 +22,7 @@ RODS = ("plain", "as_built")
 PAYLOADS = ("ignored", "carried")
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
+_NEEDS = ("tip_accuracy", "plant_step", "control_step")  # of the simulation
 _EARLY = 1 - 1e-9  # of a time: what is no earlier comes at that time
 
 
@@ -174,13 +175,16 @@ def read_payload(file: Table) -> Payload | None:
         return Payload(table.number("mass", above=0.0), pick, table.number("place", above=pick))
 
 
-def read_need(file: Table) -> Need | None:
-    """Take a scene's [need] table, if it has one."""
+def read_need(file: Table) -> tuple[Need | None, float | None]:
+    """Take a scene's [need] table, if it has one: what is asked of the simulation, and of the delay margin [s]."""
     if not file.has("need"):
-        return None
+        return None, None
     with file.table("need") as table:
-        numbers = [table.number(key, above=0.0) for key in ("tip_accuracy", "plant_step", "control_step")]
-        return Need(1e-3 * numbers[0], 1e-6 * numbers[1], 1e-6 * numbers[2])
+        margin = table.number("delay_margin", above=0.0) if table.has("delay_margin") else None
+        if margin is not None and not any(map(table.has, _NEEDS)):
+            return None, margin
+        numbers = [table.number(key, above=0.0) for key in _NEEDS]
+        return Need(1e-3 * numbers[0], 1e-6 * numbers[1], 1e-6 * numbers[2]), margin
 
 
 def read_finding(file: Table) -> Finding | None:

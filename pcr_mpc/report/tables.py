@@ -39,6 +39,7 @@ def summary_table(summary: dict[str, Any]) -> str:
         f"controller  {summary['controller']}",
         f"plant       {summary['plant']}",
         *_need_lines(summary["rung"], summary["need"]),
+        *_margin_lines(summary.get("delay_margin")),
         "",
     ]
     tracking = [
@@ -90,6 +91,18 @@ def _strain_line(strain: float | None, limit: float | None) -> list[str]:
     if strain is None:
         return []
     return [f"largest strain    {100 * strain:.3f} %" + ("" if limit is None else f" (limit {100 * limit:g} %, soft)")]
+
+
+def _margin_lines(margin: dict[str, Any] | None) -> list[str]:
+    if margin is None:
+        return []
+    predicted, needed = margin["predicted_ms"], margin["needed_ms"]
+    text = "no limit found" if predicted is None else f"bears {predicted:.3g} ms more, predicted"
+    text = text if predicted != 0.0 else "NOT STABLE, predicted: see pcr-mpc margins"
+    if needed is not None:
+        enough = predicted is None or predicted >= needed
+        text += f"; needed are {needed:g} ms" + ("" if enough else ": NOT ENOUGH, see pcr-mpc margins")
+    return [f"delay       {text}"]
 
 
 def _need_lines(rung: dict[str, Any] | None, need: dict[str, Any] | None) -> list[str]:
@@ -149,13 +162,15 @@ def tuning_comments(search: Search, chosen: Chosen, trials: int, commit: str) ->
 
 
 def _costs(chosen: Chosen) -> list[tuple[str, float, float]]:
-    shown = (
+    shown: tuple[tuple[str, str, float], ...] = (
         ("RMS under mismatch [mm]", "tracking_mm", 1.0),
         ("RMS without [mm]", "nominal_mm", 1.0),
         ("effort [rad/s^2]", "effort_rad_s2", 1.0),
         ("control step, CPU time [us]", "step_time_us", 1.0),
         ("failed episodes [%]", "failure_rate", 100.0),
     )
+    if chosen.costs.delay_margin_ms:
+        shown += (("predicted delay margin [ms]", "delay_margin_ms", 1.0),)
     return [
         (name, scale * getattr(chosen.costs, key), scale * getattr(chosen.start, key)) for name, key, scale in shown
     ]

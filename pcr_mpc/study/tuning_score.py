@@ -8,8 +8,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..control.tuning import Tuning
+from ..errors import MarginsError
 from ..loop.scene import Scene
 from .episodes import Row, run_episode
+from .margins.predicted import LONGEST, predict_delay_margin
 from .spread import EXACT, Spread
 
 # What each cost counts for, as a ratio to that of the start, and below which value it is not worth lowering: a camera
@@ -23,7 +25,8 @@ _TERMS = {
     "step_time": (1, 1e-3),
 }
 _FAST = 0.1
-# A failed episode, or a control step that does not fit its period, as a share of all; no tracking makes up for them.
+# A failed episode, or a control step that does not fit its period, as a share of all, and what is missing to a needed
+# delay margin, as a share of it; no tracking makes up for them.
 _PENALTY = 20.0
 # A ratio is cut here: what is a hundred times as bad is bad enough, and infinite where there was no run at all.
 _WORST_RATIO = 100.0
@@ -50,6 +53,10 @@ class Costs:
         Share of the episodes that failed.
     late : float
         Share of the control steps without mismatch whose CPU time exceeds the period.
+    delay_margin_ms : float
+        Predicted further delay that the loop bears, where the scene needs one; else 0.
+    margin_lack : float
+        Share that is missing to what the scene needs of it.
     """
 
     tracking_mm: float
@@ -59,6 +66,8 @@ class Costs:
     step_time: float
     failure_rate: float
     late: float
+    delay_margin_ms: float = 0.0
+    margin_lack: float = 0.0
 
     def row(self) -> dict[str, float]:
         """Plain columns."""
@@ -82,7 +91,20 @@ def measure(scene: Scene, start: Tuning, tuning: Tuning, seeds: Sequence[int], s
         step_time=1.0 if mine == theirs else mine / theirs,
         failure_rate=sum(bool(row["failure"]) for row in [nominal, *rows]) / (1 + len(rows)),
         late=float(nominal["timing"]["late"] or 0.0),
+        **_margin(scene, tuning),
     )
+
+
+def _margin(scene: Scene, tuning: Tuning) -> dict[str, float]:
+    """What is predicted of the delay margin, and missing to it, where the scene needs one."""
+    if scene.delay_margin is None:
+        return {}
+    try:
+        found = predict_delay_margin(scene, tuning).value
+    except MarginsError:  # a reference without linear models on the way: nothing is known to be borne
+        found = 0.0
+    lack = max(0.0, 1.0 - found / scene.delay_margin)
+    return {"delay_margin_ms": 1e3 * min(found, LONGEST * (tuning.period or scene.period)), "margin_lack": lack}
 
 
 def score(costs: Costs, start: Costs) -> float:
@@ -100,7 +122,7 @@ def _ratio(costs: Costs, start: Costs, name: str, floor: float) -> float:
 
 
 def _penalty(costs: Costs) -> float:
-    return _PENALTY * (costs.failure_rate + costs.late)
+    return _PENALTY * (costs.failure_rate + costs.late + costs.margin_lack)
 
 
 def _mean(rows: Sequence[Row], name: str) -> float:

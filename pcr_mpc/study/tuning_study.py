@@ -189,7 +189,8 @@ def _ask(study: Study, search: Search) -> Trial:
 
 def _confirm(search: Search, executor: Executor, progress: bool) -> Chosen | None:
     """Run the best of the search on other episodes; the first that still beats the start there is chosen."""
-    better = [row for row in finished_trials(search) if row["score"] < 1.0]
+    rows = [row for row in finished_trials(search) if not row.get("margin_lack")]
+    better = [row for row in rows if row["score"] < 1.0]
     if not better:
         return None
     least = min(row["score"] for row in better)

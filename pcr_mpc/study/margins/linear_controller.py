@@ -42,6 +42,8 @@ class Believed(NamedTuple):
         Of the observer. None: there is none, the velocity is measured.
     delay : int
         Control periods that are predicted over.
+    pull : float
+        Share by which measured angles pull in a period those that are planned from; 1: these are the measured ones.
     """
 
     model: LinearModel
@@ -49,6 +51,7 @@ class Believed(NamedTuple):
     G: np.ndarray
     gain: np.ndarray | None
     delay: int
+    pull: float = 1.0
 
 
 def feedback_of(law: Law, believed: Believed, limits: Limits, resting: LinearModel) -> Feedback:
@@ -99,27 +102,32 @@ def linear_controller(believed: Believed, feedback: Feedback) -> Sampled:
     """The controller as a linear system from measured states to rates.
 
     Its state is [state expected at the measurement, observed force, commands that it knows to be on the way, the oldest
-    first, last rates]. The target of the motors is where the rods carry the observed force: at rest its Newton
-    iteration has converged.
+    first, last rates, angles to which the commands lead]. The target of the motors is where the rods carry the observed
+    force: at rest its Newton iteration has converged.
     """
     model, gain = believed.model, believed.gain
     n_states, n = model.B.shape
-    sizes = [n_states, 2, *[n] * believed.delay, n, n_states]
+    sizes = [n_states, 2, *[n] * believed.delay, n, n, n_states]
     # Every quantity is a matrix by which it depends on [state, measurement].
-    expected, force, *on_the_way, before, measured = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
+    expected, force, *on_the_way, before, led, measured = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
     if gain is None:
         estimate, force = measured, 0.0 * force
     else:
-        surprise = measured[:2] - expected[:2]
-        estimate = np.vstack([expected[:4] + gain[:4] @ surprise, measured[4:]])
+        tip = expected[:4]
+        if believed.pull < 1.0:  # the tip has moved with the angles as they are measured to have turned
+            tip = tip + model.B[:4] @ (measured[4:] - expected[4:]) / model.dt
+        surprise = measured[:2] - tip[:2]
+        estimate = np.vstack([tip + gain[:4] @ surprise, measured[4:]])
         force = force + gain[4:] @ surprise
     ahead = estimate
     for u in on_the_way:
         ahead = model.A @ ahead + model.B @ u + model.E @ force
+    planned = ahead[4:] + (1.0 - believed.pull) * (led + model.dt * before - ahead[4:])
+    ahead = np.vstack([ahead[:4], planned])
     shift = np.linalg.pinv(believed.G) @ force
     u = feedback.state @ ahead + feedback.shift @ shift + feedback.force @ force + feedback.previous @ before
     on_the_way = [*on_the_way, u]
     following = model.A @ estimate + model.B @ on_the_way[0] + model.E @ force
-    state = np.vstack([following, force, *on_the_way[1:], u])
+    state = np.vstack([following, force, *on_the_way[1:], u, planned])
     (a, b), (c, d) = (np.split(each, [len(state)], axis=1) for each in (state, u))
     return Sampled(a, b, c, d)

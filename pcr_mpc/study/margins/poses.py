@@ -11,8 +11,8 @@ from ...control.tuning import Tuning
 from ...errors import MarginsError, PCRError
 from ...linearisation.linear_model import LinearModel
 from ...linearisation.linearise import linearise
-from ...loop.feed_forward import feed_forward
-from ...loop.parts import make_law, make_model, make_observer, motor_limits
+from ...loop.feed_forward import InverseDynamics, feed_forward
+from ...loop.parts import make_law, make_model, make_observer, motor_limits, pull
 from ...loop.scene import Scene
 from ...plant.motion.plant import DERIVATIVE_ACCURACY, Plant
 from ...plant.robot import Robot
@@ -58,6 +58,8 @@ class LinearLoops:
         Instead of the scene's own.
     poses : int
         How many, at equal times.
+    reference : InverseDynamics, optional
+        Of the scene's reference, if they are known already: most of what it costs.
 
     Attributes
     ----------
@@ -72,7 +74,10 @@ class LinearLoops:
         passes poses without a linear model.
     """
 
-    def __init__(self, scene: Scene, tuning: Tuning | None = None, *, poses: int = 24) -> None:
+    def __init__(
+        self, scene: Scene, tuning: Tuning | None = None, *, poses: int = 24,
+        reference: InverseDynamics | None = None,
+    ) -> None:  # fmt: skip
         tuning = tuning or scene.tuning
         if scene.trajectory is None or tuning is None:
             raise MarginsError(
@@ -88,18 +93,18 @@ class LinearLoops:
         self.scene = scene = scene.tuned(tuning)
         self.tuning = tuning
         try:
-            self.poses = self._along(poses)
+            self.poses = self._along(poses, reference)
         except (PCRError, ValueError) as error:
             raise MarginsError(
                 f"scene {scene.name} with tuning {tuning.name}: no linear loop along the reference: {error}"
             ) from error
 
-    def _along(self, count: int) -> list[PoseOfReference]:
+    def _along(self, count: int, reference: InverseDynamics | None) -> list[PoseOfReference]:
         scene, tuning = self.scene, self.tuning
         robot, period, start = scene.robot, scene.period, scene.start()
         n = robot.n_rods
         known = scene if tuning.model.payload else replace(scene, payload=None)
-        reference = feed_forward(known, robot, start, 0, tuning.model.inertia)
+        reference = reference or feed_forward(known, robot, start, 0, tuning.model.inertia)
         model, target, real = make_model(robot, tuning.model), Plant(robot), self._plant(robot)
         rest = np.concatenate([start.p, np.zeros(2), start.q])
         for plant in (model, target, real):
@@ -118,7 +123,7 @@ class LinearLoops:
             there: LinearModel = linearise(model, x, np.zeros(n), period)
             _, stiffness, by_angle = target.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
             believed = Believed(there, stiffness.copy(), by_angle.copy(), None if observer is None else observer.gain,
-                                delay)  # fmt: skip
+                                delay, pull(tuning.model, period))  # fmt: skip
             feedback: Feedback = feedback_of(law, believed, limits, resting)
             found.append(
                 PoseOfReference(t, x.copy(), real.equilibrium(x), payload, linear_controller(believed, feedback))

@@ -11,12 +11,13 @@ import numpy as np
 
 from ...control.tuning import Tuning
 from ...frozen import Frozen
+from ...loop.feed_forward import InverseDynamics
 from ...loop.scene import Scene
 from .linear_loop import LinearLoop, frequency_response
 from .poses import LinearLoops, PoseOfReference, scaled
 from .search import first_loss
 
-_LONGEST, _PER_PERIOD = 30, 4  # periods of delay that are tried, and steps of each
+LONGEST, _PER_PERIOD = 30, 4  # periods of delay that are tried, and steps of each
 _DELAY_TOLERANCE, _FACTOR_TOLERANCE = 1e-3, 2e-3  # of a period; of a factor
 _FACTORS = np.geomspace(1.0, 32.0, 21)  # from one to the next 19 % more
 _FREQUENCIES = 400  # from a thousandth of the Nyquist frequency on
@@ -118,12 +119,14 @@ class Margins(Frozen):
 
 def delay_margin(loop: LinearLoop) -> float:
     """Further delay up to which a linear loop is stable [s]; NaN: it is not stable as it is."""
-    steps = np.arange(_LONGEST * _PER_PERIOD + 1) * loop.period / _PER_PERIOD
+    steps = np.arange(LONGEST * _PER_PERIOD + 1) * loop.period / _PER_PERIOD
     return first_loss(lambda time: loop.later(time).spectral_radius() < 1.0, steps.tolist(),
                       _DELAY_TOLERANCE * loop.period)  # fmt: skip
 
 
-def predict_delay_margin(scene: Scene, tuning: Tuning | None = None, *, poses: int = 9) -> Least:
+def predict_delay_margin(
+    scene: Scene, tuning: Tuning | None = None, *, poses: int = 9, reference: InverseDynamics | None = None
+) -> Least:
     """Further delay that a loop bears, predicted by the linear closed loop where it is least along the reference.
 
     Parameters
@@ -133,6 +136,8 @@ def predict_delay_margin(scene: Scene, tuning: Tuning | None = None, *, poses: i
         Instead of the scene's own.
     poses : int
         At equal times along the reference.
+    reference : InverseDynamics, optional
+        Of the scene's reference, if they are known already: most of what it costs.
 
     Returns
     -------
@@ -144,7 +149,7 @@ def predict_delay_margin(scene: Scene, tuning: Tuning | None = None, *, poses: i
     MarginsError
         As `LinearLoops`.
     """
-    loops = LinearLoops(scene, tuning, poses=poses)
+    loops = LinearLoops(scene, tuning, poses=poses, reference=reference)
     found = [(0.0 if math.isnan(margin := delay_margin(loop)) else margin, loop) for loop in loops.all()]
     least, loop = min(found, key=lambda pair: pair[0])
     return Least(least, loop.t, (float(loop.p[0]), float(loop.p[1])))
