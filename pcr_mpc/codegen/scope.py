@@ -65,6 +65,8 @@ def _choices(scene: Scene, tuning: Tuning) -> list[tuple[str, Any, tuple[Any, ..
         ("plant that carries a payload with inertia", carrying, ("none", "constant"), "set [plant] inertia"),
         ("snapping plant", plant.on_snap, ("raise",), "set [plant] on_snap"),
         ("motors that do not follow at once", scene.motors, (None,), "leave [motors] out"),
+        ("camera that is late or rare", scene.camera, (None,), "leave latency, every and lost out of [sensor]"),
+        ("latency of the tip [s]", tuning.observer.latency if tuning.observer else 0.0, (0.0,), other),
         ("untold delay [s]", scene.untold_delay, (0.0,), "leave [control] untold_delay out"),
         ("start that moves, at [m/s]", tuple(scene.start_velocity), ((0.0, 0.0),), "start at rest"),
     ]

@@ -35,6 +35,9 @@ class ObserverTuning:
         together each gets its share by how far it is believed to walk.
     adapt_walk : float
         Of their change from one period to the next, over what they are believed to be.
+    latency : float
+        Age of a measured tip when it arrives, as far as it is known [s]: it corrects the estimate of that time, and the
+        present follows from there. Angles are taken to be of the present.
     """
 
     tip_noise: float = 1e-5
@@ -42,6 +45,7 @@ class ObserverTuning:
     force_walk: float = 0.005
     adapts: tuple[str, ...] = ()
     adapt_walk: float = 0.005
+    latency: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "adapts", tuple(self.adapts))
@@ -49,8 +53,15 @@ class ObserverTuning:
             raise ModelError(f"adapts: {unknown[0]!r} is none of {', '.join(ADAPTS)}", key="observer.adapts")
         if len(set(self.adapts)) < len(self.adapts):
             raise ModelError(f"adapts names one twice: {', '.join(self.adapts)}", key="observer.adapts")
+        object.__setattr__(self, "latency", checked_number("latency", self.latency, minimum=0.0))
+        if self.adapts and self.latency:
+            raise ModelError(
+                f"adapts {', '.join(self.adapts)} with a latency of {self.latency} s: what adapts looks at tips of the "
+                "present; leave one of the two out",
+                key="observer.adapts",
+            )
         for field in fields(self):
-            if field.name == "adapts":
+            if field.name in ("adapts", "latency"):
                 continue
             object.__setattr__(self, field.name, checked_number(field.name, getattr(self, field.name), above=0.0))
 
@@ -68,6 +79,8 @@ class DisturbanceObserver:
     model : LinearModel
         About the pose for which the gain is computed. It depends little on the pose: what matters is
         sqrt(K/m) dt, which is small.
+    every : int
+        Periods from one measured tip to the next.
 
     Attributes
     ----------
@@ -77,9 +90,11 @@ class DisturbanceObserver:
         Half the resolution of the encoders [rad].
     """
 
-    def __init__(self, tuning: ObserverTuning, tip_noise: float, angle_step: float, model: LinearModel) -> None:
+    def __init__(
+        self, tuning: ObserverTuning, tip_noise: float, angle_step: float, model: LinearModel, every: int = 1
+    ) -> None:
         n = model.B.shape[1]
-        self.gain = _gain(tuning, max(tip_noise, tuning.tip_noise), model)
+        self.gain = _gain(tuning, max(tip_noise, tuning.tip_noise), model, every)
         self.half_step = angle_step / 2
         self._correct = BufferedFunction(correction(n))
         self._memory = np.zeros(6 + n)
@@ -143,7 +158,7 @@ def correction(n: int) -> Any:
     return ca.Function("correct", [estimate, measured, gain, half_step], [corrected])
 
 
-def _gain(tuning: ObserverTuning, tip_noise: float, model: LinearModel) -> np.ndarray:
+def _gain(tuning: ObserverTuning, tip_noise: float, model: LinearModel, every: int = 1) -> np.ndarray:
     """Gain of the filter, shape (6, 2): what a surprise in the tip position says about [p, v, d]."""
     a = np.block([[model.A[:4, :4], model.E[:4]], [np.zeros((2, 4)), np.eye(2)]])
     noise = np.block([[model.E[:4], np.zeros((4, 2))], [np.zeros((2, 2)), np.eye(2)]])
@@ -156,6 +171,9 @@ def _gain(tuning: ObserverTuning, tip_noise: float, model: LinearModel) -> np.nd
     a = a * units / units[:, None]
     noise = noise / units[:, None]
     driven = noise @ covariance @ noise.T
+    if every > 1:
+        powers = [np.linalg.matrix_power(a, j) for j in range(every)]
+        a, driven = a @ powers[-1], np.asarray(sum(power @ driven @ power.T for power in powers))
     error = solve_discrete_are(a.T, output.T, (driven + driven.T) / 2, np.eye(2))
     # Not the gain that predicts, but the one that corrects.
     gain = error @ output.T @ np.linalg.inv(output @ error @ output.T + np.eye(2))

@@ -325,6 +325,7 @@ def load_tuning(path: str | Path) -> Tuning:
             force_walk=observer.number("force_walk", ObserverTuning.force_walk, above=0.0),
             adapts=observer.texts("adapts") if observer.has("adapts") else (),
             adapt_walk=observer.number("adapt_walk", ObserverTuning.adapt_walk, above=0.0),
+            latency=observer.number("latency", ObserverTuning.latency, minimum=0.0),
         )
         law = file.text("law", LAWS[0], choices=LAWS)
         predicts, weighs = law.endswith("mpc"), law.endswith("mpc") or law == "lqr"

@@ -26,6 +26,7 @@ from .adaptation import Adaptation
 from .controllers import Decision
 from .foresight import Foresight, Outlook
 from .gate import Event, Gate
+from .hardware.past import PastEstimates
 from .learning.learner import Learner
 from .live.reference import LiveReference
 from .parts import resting_state
@@ -51,8 +52,9 @@ class ControlStep:
 
     Attributes
     ----------
-    law, foresight, observer, watch, track, learner, adaptation, delay, fallback
+    law, foresight, observer, past, watch, track, learner, adaptation, delay, fallback
         Set, and set anew, by the controller between two steps: the control law, what looks ahead, the observer or None,
+        estimates that late tips correct or None,
         the limits of a pose, windows of the reference, what learns from its laps or None, what adapts or None,
         the periods that are predicted over, and whether a failure is raised.
     inverse : MotorTarget
@@ -81,6 +83,7 @@ class ControlStep:
         self.robot, self.limits = robot, limits
         self._period, self._gate = period, gate
         self.observer: DisturbanceObserver | None = None
+        self.past: PastEstimates | None = None
         self.learner: Learner | None = None
         self.adaptation: Adaptation | None = None
         self.inverse = MotorTarget(robot)
@@ -105,6 +108,8 @@ class ControlStep:
         self.foresight.inputs["estimate"][:-2] = x
         if self.observer is not None:
             self.observer.start(x)
+        if self.past is not None:
+            self.past.clear()
         self.watch.reset(x, pose)
         self.inverse.start(pose)
         self._gate.start(pose.q)
@@ -130,6 +135,8 @@ class ControlStep:
         self.inverse.start(pose)
         self._gate.start(x[4:], first=False)
         self.plan, self.pose = None, pose
+        if self.past is not None:
+            self.past.clear()
         if not force.any():
             return
         # The motors carry the load from the first step on.
@@ -210,11 +217,16 @@ class ControlStep:
             self.adaptation.predict(self._predicts[0], estimate, here, force)
         known = foresight.inputs["estimate"]
         known[:-2], known[-2:] = here, force
+        if self.past is not None:
+            self.past.remember(corrected, self._predicts[0])
         return Decision(u, plan, linearised - began, estimate, force, events)
 
     def _believe(self, k: int, x: np.ndarray, given: dict[str, np.ndarray]) -> tuple[Event, ...]:
         """Write what is believed of a measurement; what is not is as expected."""
-        expected, observer = given["estimate"][:-2], self.observer
+        expected, observer, past = given["estimate"][:-2], self.observer, self.past
+        if past is not None:
+            # As far from where it is expected as it was from where it was when the picture was taken.
+            x = np.concatenate([x[:2] + (expected[:2] - past.tip(expected)), x[2:]])
         found = self._gate.sift(k, x, expected, observer is None)
         self.k, self.believed = k, (found.p is not None, found.q is not None)
         if observer is None:
@@ -224,6 +236,13 @@ class ControlStep:
                 expected[4:] = found.q
         elif found.velocity is not None:
             observer.move(found.p, found.velocity)
+            if past is not None:
+                past.clear()
+        elif past is not None and found.p is not None:
+            change = past.correct(observer.gain @ (np.array(found.p) - expected[:2]))
+            given["estimate"][:4] += change[:4]
+            given["estimate"][-2:] += change[4:]
+            found.p = None  # it is done with
         if self.learner is not None:
             self.learner.see(k, found.p)
         measured = given["measured"]

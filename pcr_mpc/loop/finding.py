@@ -30,6 +30,8 @@ def digest(scene: Scene) -> str:
         facts["untold_delay"] = _facts(scene.untold_delay)
     if scene.motors is not None:
         facts["motors"] = _facts(scene.motors)
+    if scene.camera is not None:
+        facts["camera"] = _facts(scene.camera)
     facts["trajectory"] = own_motion(scene) or _facts(scene.trajectory)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
 

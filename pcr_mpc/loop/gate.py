@@ -71,24 +71,27 @@ class Gate:
     wrapped : bool
         Measured angles are known up to whole turns only: of those that are possible the nearest to the prediction is
         meant.
+    every : int
+        Periods from one measured tip to the next; that there is none in between is no news.
     """
 
     def __init__(
-        self, robot: Robot, limits: Limits, dt: float, tip_noise: float, angle_step: float, wrapped: bool
-    ) -> None:
+        self, robot: Robot, limits: Limits, dt: float, tip_noise: float, angle_step: float, wrapped: bool,
+        every: int = 1,
+    ) -> None:  # fmt: skip
         self._reach = [(*rod.base, rod.length) for rod in robot.rods]
         self._near = _SURPRISE * float(robot.lengths.min()) + _DEVIATIONS * tip_noise
         self._turn = limits.rate * dt * (1 + 1e-9) + angle_step
         self._lower = (limits.angle_lower - angle_step).tolist()
         self._upper = (limits.angle_upper + angle_step).tolist()
-        self._dt, self._wrapped = dt, wrapped
+        self._dt, self._wrapped, self._every = dt, wrapped, every
         self.start(np.zeros(robot.n_rods))
 
     def start(self, q: np.ndarray, *, first: bool = True) -> None:
         """Begin with motors that are at the angles q [rad]; ``first``: what is measured next is looked at for units."""
         self._tip, self._encoders = _Sensor(), _Sensor()
         self._before = q.tolist()
-        self._first = first
+        self._first, self._without = first, 0
 
     def pass_by(self, count: int, q: np.ndarray) -> None:
         """Nothing was measured for so many periods, after which the motors are expected at q [rad]."""
@@ -135,7 +138,10 @@ class Gate:
                 self._encoders.believed(self._turn)
             else:
                 found.note("measurement", k, f"{text}; bridged by the prediction")
-        if tip_why is None:
+        self._without = self._without + 1 if p[0] != p[0] else 0
+        if 0 < self._without < self._every:
+            pass  # none is due
+        elif tip_why is None:
             self._tip.believed(math.hypot(p[0] - due[0], p[1] - due[1]))
             found.p = p
         else:
@@ -145,7 +151,8 @@ class Gate:
             before = self._tip.last
             insists = self._tip.refused(p, 2 * self._near)
             if insists and before is not None and not self._too_far(p[0], p[1], 0.0):
-                found.p, found.velocity = p, [(now - then) / self._dt for now, then in zip(p, before, strict=True)]
+                between = self._every * self._dt
+                found.p, found.velocity = p, [(now - then) / between for now, then in zip(p, before, strict=True)]
                 found.note("reinitialised", k, f"{text}; told so {PATIENCE} times in a row, and believed now")
                 self._tip.believed(self._near)
             else:

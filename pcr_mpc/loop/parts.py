@@ -22,6 +22,7 @@ from ..plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 from .foresight import Foresight
 from .foresight_graph import Places
 from .gate import Gate
+from .hardware.past import PastEstimates
 from .scene import Scene
 
 # In which an angle that was commanded and is not measured counts as lost [s]: many times what motors lag.
@@ -57,7 +58,8 @@ def resting_model(robot: Robot, model: Model, pose: Equilibrium, period: float) 
 
 def make_gate(scene: Scene, tuning: Tuning, robot: Robot, limits: Limits) -> Gate:
     """Gate for the scene's sensors."""
-    return Gate(robot, limits, scene.period, tip_noise(scene, tuning), scene.angle_step, scene.wrapped)
+    return Gate(robot, limits, scene.period, tip_noise(scene, tuning), scene.angle_step, scene.wrapped,
+                1 if scene.camera is None else scene.camera.every)  # fmt: skip
 
 
 def tip_noise(scene: Scene, tuning: Tuning) -> float:
@@ -69,7 +71,15 @@ def make_observer(scene: Scene, tuning: Tuning, resting: LinearModel) -> Disturb
     """Observer, if the tuning wants one; ``resting`` is the linear model about the start."""
     if tuning.observer is None:
         return None
-    return DisturbanceObserver(tuning.observer, scene.tip_noise, scene.angle_step, resting)
+    every = 1 if scene.camera is None else scene.camera.every
+    return DisturbanceObserver(tuning.observer, scene.tip_noise, scene.angle_step, resting, every)
+
+
+def make_past(tuning: Tuning, period: float) -> PastEstimates | None:
+    """Past estimates, if the tuning says that measured tips are late."""
+    if tuning.observer is None or tuning.observer.latency <= 0.0:
+        return None
+    return PastEstimates(tuning.observer.latency / period, period)
 
 
 def make_law(

@@ -20,6 +20,7 @@ from ..linearisation.pose_limits import PoseLimits
 from ..plant.robot import Robot
 from ..plant.rod import Rod
 from ..plant.statics.equilibrium import Equilibrium
+from .hardware.camera import Camera
 from .hardware.motors import Motors
 from .references.reading import KINDS, built_in
 from .scene import Scene
@@ -75,7 +76,7 @@ class Recorded:
 
 
 _KINDS: tuple[type, ...] = (
-    Scene, Robot, Rod, PlantSettings, Payload, Need, Finding, PoseLimits, Motors, Tuning, Model, ObserverTuning,
+    Scene, Robot, Rod, PlantSettings, Payload, Need, Finding, PoseLimits, Motors, Camera, Tuning, Model, ObserverTuning,
     LearningTuning, *KINDS, Recorded, Equilibrium,
 )  # fmt: skip
 _BY_NAME = {kind.__name__: kind for kind in _KINDS}

@@ -15,6 +15,7 @@ from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.free_tip import forward_statics, inverse_statics
+from .hardware.camera import Camera
 from .hardware.motors import Motors
 from .scene_checks import LATE, check_scene, is_multiple, require_within_stops
 from .settings import Finding, Need, Payload, PlantSettings
@@ -83,6 +84,8 @@ class Scene:
         How the motors follow their commands, which no controller is told. None: at once.
     delay_margin : float or None
         Further delay that the loop of a tuning must bear [s] (see `predict_delay_margin`). None: nothing is asked.
+    camera : Camera or None
+        How the measured tip reaches the controller, which is told how often, and not how late. None: at once.
     """
 
     name: str
@@ -112,6 +115,7 @@ class Scene:
     untold_delay: float = 0.0
     motors: Motors | None = None
     delay_margin: float | None = None
+    camera: Camera | None = None
 
     @property
     def allowed_error(self) -> float:

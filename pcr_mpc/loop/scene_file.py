@@ -12,6 +12,7 @@ from ..control.tuning import load_tuning
 from ..errors import ModelError
 from ..plant.robot import load_robot
 from ..toml_table import Table, read_toml
+from .hardware.camera import read_camera
 from .hardware.motors import read_motors
 from .references.blended import duration_of
 from .references.reading import read_reference
@@ -76,13 +77,14 @@ def load_scene(path: str | Path) -> Scene:
             noise = sensor.number("tip_noise", 0.0, minimum=0.0)
             angle_step = sensor.number("angle_step", 0.0, minimum=0.0)
             wrapped = sensor.boolean("wrapped", False)
+            camera = read_camera(sensor)
         payload = read_payload(file)
         (need, margin), finding, moved_by = read_need(file), read_finding(file), read_motors(file)
         scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
                       tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
                       delay, deadline, late, pose_limits, payload, need, finding,
                       wrapped=wrapped, tracking_error=tracking_error, untold_delay=untold_delay,
-                      motors=moved_by, delay_margin=margin)  # fmt: skip
+                      motors=moved_by, delay_margin=margin, camera=camera)  # fmt: skip
     if (trajectory is None) != (tuning is None):
         raise ModelError(
             f"{path}: a reference needs control.tuning, and reference.kind = 'none' has no use for it",

@@ -21,6 +21,7 @@ from .controllers import Controller, decision_of, name_of
 from .feasibility import demand_line, reference_demand, reference_excess
 from .feed_forward import InverseDynamics, feed_forward
 from .foreign_parts import check_parts
+from .hardware.camera import IDEAL, Pictures
 from .hardware.drive import drive_of
 from .record import versions
 from .run import Run
@@ -91,6 +92,7 @@ def simulate(
     later = UntoldDelay(scene.untold_delay, plant.dt, n)
 
     drive = drive_of(scene, plant.dt, pose)
+    pictures = None if scene.camera in (None, IDEAL) else Pictures(scene.camera, plant.dt, seed)
     states = np.empty((n_periods * per + 1, len(x)))
     inputs = np.empty((n_periods, n))
     plant_time = np.empty(n_periods * per)
@@ -155,6 +157,8 @@ def simulate(
             measured = x.copy()
             if drive is not None:
                 measured[4:] = drive.angles(x)
+            if pictures is not None:
+                measured[:2] = pictures.tip(k, states[: done + 1])
             if scene.tip_noise:
                 measured[:2] += noise.normal(0.0, scene.tip_noise, 2)
             if scene.angle_step:

@@ -34,6 +34,7 @@ from .parts import (
     make_law,
     make_model,
     make_observer,
+    make_past,
     motor_limits,
     resting_model,
     resting_state,
@@ -169,6 +170,7 @@ class TrackingController(OnTheFly, Remade):
         work.law.prepare(resting, work.watch.combinations())
         work.observer = make_observer(self._told, self.tuning, resting)
         adapt(work, self.tuning, self._told, resting)
+        work.past = make_past(self.tuning, self._told.period)
         work.restart(pose, resting, self._told.delay)
         write_constants(work.foresight, self.tuning, work.law, work.limits, work.observer)
 
@@ -225,7 +227,7 @@ class TrackingController(OnTheFly, Remade):
         resting = self._rest() if model_changed else self._resting
         observer = work.observer
         if model_changed or tuning.observer != old.observer:
-            work.observer = make_observer(self._told, tuning, resting)
+            work.observer, work.past = make_observer(self._told, tuning, resting), make_past(tuning, self._told.period)
             if work.observer is not None:
                 work.observer.start(here)
                 if observer is not None:

@@ -115,6 +115,7 @@ def _toml(tuning: Tuning, comments: Sequence[str]) -> str:
             "",
             "[observer]",
             f"{'on = true':26}# tip velocity and an unknown force from the measured tip and angles",
+            _line("latency", observer.latency, "s, age of a measured tip when it arrives"),
             _line("tip_noise", observer.tip_noise, "m, at least; a scene's sensor may be worse"),
             _line("force_noise", observer.force_noise, "N, forces that come and go"),
             _line("force_walk", observer.force_walk, "N, change of the unknown force in a period"),
