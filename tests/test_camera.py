@@ -137,3 +137,12 @@ def test_a_scene_has_a_camera_and_refuses_wrong_ones(tmp_path):
     path.write_text(text.replace("../../controllers", str(CONTROLLERS)).replace("every = 2", "every = 0"))
     with pytest.raises(ModelError, match="every"):
         load_scene(path)
+
+
+@pytest.mark.slow
+def test_lag_and_latency_that_are_known_cost_little():
+    """All of it at once, and an unknown load; the noise of a picture is 0.05 mm."""
+    scene = load_scene(MODELS / "scenes" / "servo.toml")
+    summary = simulate(scene, scene.make_plant(), make_controller(scene)).summary()
+    assert summary["rms_after_1s_mm"] < 0.15
+    assert (summary["verdict"], summary["failures"], summary["limit_violations"]) == ("", 0, 0)
