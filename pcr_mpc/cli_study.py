@@ -14,6 +14,7 @@ from .errors import OutputError
 from .files import require_folder, require_free, results, saved
 from .loop.scene import Scene
 from .loop.scene_file import load_scene
+from .plant.uncertainty import load_uncertainty
 from .report.choice_tables import choice_record, choice_table
 from .report.csv_rows import write_rows
 from .report.tables import tuning_comments, tuning_table
@@ -22,6 +23,7 @@ from .report.trade_off import plot_trade_off
 from .study.choice import choose
 from .study.chosen_rung import require_plant_table, write_rung
 from .study.episodes import lighter
+from .study.identification.robot_file import robot_path
 from .study.parallel import local_workers
 from .study.provenance import commit
 from .study.spread import Spread
@@ -44,7 +46,8 @@ def choose_rung(options: argparse.Namespace) -> int:
             )
         require_plant_table(options.scene)
         require_free(options.scene, force=True)
-    choice = choose(scene, progress=True)
+    known = load_uncertainty(robot_path(options.scene))
+    choice = choose(scene, progress=True, **({} if known is None else {"uncertainty": known}))
     interrupt.check()
     print(json.dumps(choice_record(choice)) if options.json else f"\n{choice_table(choice)}")
     if options.write:

@@ -13,6 +13,8 @@ from ..study.estimates import Estimate
 from ..study.rungs import ladders, levels, named
 from .tables import table
 
+_NOT_WORTH = "not worth its time"
+
 
 def choice_record(choice: Choice) -> dict[str, Any]:
     """Everything about a choice, ready for JSON."""
@@ -32,15 +34,62 @@ def choice_record(choice: Choice) -> dict[str, Any]:
             for ladder, level, effect, estimate in _estimates(choice)
         ],
         "neighbours": [
-            {"ladder": ladder, "from": low, "to": high, "mm": _finite(1e3 * difference)}
+            {
+                "ladder": ladder,
+                "from": low,
+                "to": high,
+                "mm": _finite(1e3 * difference),
+                "worth_its_time": _worth(choice, difference),
+            }
             for ladder, low, high, difference in neighbours(choice)
         ],
-        "physics": [_measured(one) for one in choice.physics],
+        "numbers": _numbers(choice),
+        "physics": [{**_measured(one), "worth_its_time": choice.worth_its_time(one)} for one in choice.physics],
         "unavailable": [{**_rung(rung), "reason": reason} for rung, reason in choice.unavailable],
         "discretisations": [_measured(one) for one in choice.discretisations],
         "control_step_us": None if choice.control_step is None else 1e6 * choice.control_step,
         "chosen": {**_measured(choice.chosen), "tip_error_mm": 1e3 * choice.tip_error},
     }
+
+
+def _numbers(choice: Choice) -> dict[str, Any] | None:
+    """What the robot's numbers cost, ready for JSON."""
+    cost = choice.numbers
+    if cost is None:
+        return None
+    return {
+        "mm": 1e3 * cost.error,
+        "sampled_mm": _finite(1e3 * cost.sampled),
+        "third_mm": 1e3 * cost.least,
+        "by_number_mm": {name: 1e3 * each for name, each in cost.by_number.items()},
+        "assumed": cost.assumed,
+    }
+
+
+def _worth(choice: Choice, difference: float) -> bool:
+    """Whether what a step up changes is more than a third of what the numbers cost."""
+    return choice.numbers is None or difference > choice.numbers.least
+
+
+def _numbers_lines(choice: Choice) -> list[str]:
+    cost = choice.numbers
+    if cost is None:
+        return [
+            "what the robot's numbers are worth is not told of this motion: a payload is picked up, or rods are lost"
+        ]
+    ranked = sorted(cost.by_number.items(), key=lambda pair: -pair[1])
+    rows = [(name, _mm(each)) for name, each in ranked]
+    source = (
+        "default ranges; an [uncertainty] table in its file says better, see pcr-mpc identify"
+        if cost.assumed
+        else "the [uncertainty] table of its file"
+    )
+    return [
+        f"what the robot's numbers are worth, by {source}:",
+        table(("known to one standard deviation", "mm of the tip"), [("all of them together", _mm(cost.error)), *rows]),
+        f"  robots that were drawn and moved: {_mm(cost.sampled)} mm; a step finer than a third, {_mm(cost.least)} mm, "
+        "is not worth its time before the numbers are known better",
+    ]
 
 
 def neighbours(choice: Choice) -> list[tuple[str, str, str, float]]:
@@ -62,7 +111,10 @@ def choice_table(choice: Choice) -> str:
         (f"{effect} ({ladder} {level})", _mm(estimate.error), estimate.reason)
         for ladder, level, effect, estimate in _estimates(choice)
     ]
-    steps = [(f"{ladder}: {low} -> {high}", _mm(difference)) for ladder, low, high, difference in neighbours(choice)]
+    steps = [
+        (f"{ladder}: {low} -> {high}", _mm(difference), "" if _worth(choice, difference) else _NOT_WORTH)
+        for ladder, low, high, difference in neighbours(choice)
+    ]
     refused = sorted({f"  {named(scene, rung)}: {reason}" for rung, reason in choice.unavailable})
     lines = [
         f"{scene.name} needs the tip to {1e3 * need.tip_accuracy:g} mm, {1e6 * need.plant_step:g} us a plant step and "
@@ -74,10 +126,13 @@ def choice_table(choice: Choice) -> str:
         f"twice that step changes {_mm(choice.step_error)} mm",
         *(f"  it lacks {name}: {_mm(estimate.error)} mm are added" for name, estimate in choice.lacking.items()),
         "",
-        table(("a step up, the rest as in the yardstick", "mm"), steps),
+        _left(table(("a step up, the rest as in the yardstick", "mm", ""), steps)) if steps else "",
+        "",
+        *_numbers_lines(choice),
         "",
         table(
-            ("rung, lowest first", "mm off the yardstick", "us a step"), [_row(scene, one) for one in choice.physics]
+            ("rung, lowest first", "mm off the yardstick", "us a step", ""),
+            [(*_row(scene, one), "" if choice.worth_its_time(one) else _NOT_WORTH) for one in choice.physics],
         ),
         *(["", "not available:", *refused] if refused else []),
         "",

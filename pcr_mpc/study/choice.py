@@ -17,7 +17,9 @@ from ..loop.run import Run
 from ..loop.scene import Scene
 from ..loop.settings import Need, PlantSettings
 from ..loop.simulate import simulate
+from ..plant.uncertainty import Uncertainty
 from .estimates import Estimate, Estimates
+from .numbers_cost import NumbersCost, numbers_cost
 from .rungs import all_physics, discretisations, height, named
 
 # The yardstick's step: omega dt at most this for the fastest swing of the tip, within these parts of a period.
@@ -70,6 +72,8 @@ class Choice:
     control_step : float or None
         Of a control step with the scene's tuning, median [s]. None: nothing is controlled.
     chosen : Measured
+    numbers : NumbersCost or None
+        What the robot's numbers cost on the same motion, because they are not known better. None: it cannot be told.
     """
 
     scene: Scene
@@ -82,6 +86,7 @@ class Choice:
     discretisations: list[Measured]
     control_step: float | None
     chosen: Measured
+    numbers: NumbersCost | None = None
 
     @property
     def unmeasured(self) -> float:
@@ -92,6 +97,13 @@ class Choice:
     def tip_error(self) -> float:
         """Of the chosen rung: measured, and what the yardstick may be off [m]."""
         return self.chosen.error + self.unmeasured
+
+    def worth_its_time(self, one: Measured) -> bool:
+        """Whether a physics is no finer than the numbers deserve: none below it is within a third of what they cost."""
+        if self.numbers is None:
+            return True
+        below = self.physics[: self.physics.index(one)]
+        return not any(other.error + self.unmeasured <= self.numbers.least for other in below)
 
 
 class Bench:
@@ -133,6 +145,10 @@ class Bench:
         self._best = Measured(self.yardstick, 0.0, float(np.median(self._run.plant_time)), tips=self._run.x[:, :2])
         self.step_error = self.measure(replace(self.yardstick, dt=2 * dt)).error
 
+    def numbers_cost(self, known: Uncertainty | None) -> NumbersCost | None:
+        """What the robot's numbers cost on the same motion (see `numbers_cost`)."""
+        return numbers_cost(self._run, self.estimates.fastest, known)
+
     @property
     def control_step(self) -> float | None:
         """Median time of a control step [s]."""
@@ -164,13 +180,15 @@ def apart(one: Measured, other: Measured) -> float:
     return float(np.linalg.norm(coarse.tips - fine.tips[::stride], axis=1).max())
 
 
-def choose(scene: Scene, *, progress: bool = False) -> Choice:
+def choose(scene: Scene, *, uncertainty: Uncertainty | None = None, progress: bool = False) -> Choice:
     """Find the lowest rung that a scene needs.
 
     Parameters
     ----------
     scene : Scene
         With a `Need`.
+    uncertainty : Uncertainty, optional
+        How well the robot's numbers are known. None: default ranges.
     progress : bool
         Show a progress bar on stderr.
 
@@ -196,7 +214,7 @@ def choose(scene: Scene, *, progress: bool = False) -> Choice:
     )
     return Choice(
         scene, bench.estimates, bench.yardstick, lacking, bench.step_error, bench.unavailable, physics, tried,
-        bench.control_step, chosen,
+        bench.control_step, chosen, bench.numbers_cost(uncertainty),
     )  # fmt: skip
 
 
