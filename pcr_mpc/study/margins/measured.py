@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ... import interrupt
 from ...control.tuning import Tuning
-from ...errors import MarginsError, PCRError
+from ...errors import MarginsError, PCRError, SimulationError
 from ...loop.make_controller import make_controller
 from ...loop.run import Run
 from ...loop.scene import Scene
@@ -23,6 +23,7 @@ from .poses import LINEAR_LAWS
 _PERIODS = 300  # that a pose is held
 _PUSH = 1e-5  # of the shortest rod, by which the tip would move in a period
 _FLOOR = 1e-3  # of the largest deviation: below, what is left of a push is the solver's tolerance
+_FAR = 1e-3  # of the shortest rod: no such way of a small push has died away
 _LOST = 30.0  # times the largest deviation of the first third
 _TOLERANCE = 0.01  # of a margin
 _STEP, _FURTHEST = 1.15, 6.0  # from one try to the next, and from the guess at most
@@ -55,8 +56,26 @@ def held_scene(scene: Scene, p: tuple[float, float]) -> Scene:
                    start_velocity=(0.0, 0.0), duration=duration, payload=None)  # fmt: skip
 
 
-def push_dies_away(believed: Scene, true: Scene) -> bool:
-    """Whether a small push of the tip at the start dies away in the nonlinear simulation.
+@dataclass(frozen=True, eq=False)
+class Pushed:
+    """What became of a small push.
+
+    Attributes
+    ----------
+    dies_away : bool
+    run : Run or None
+        Without the push; None if it could not begin.
+    failure : str
+        Of a run that ended early; empty if none did.
+    """
+
+    dies_away: bool
+    run: Run | None
+    failure: str = ""
+
+
+def push(believed: Scene, true: Scene) -> Pushed:
+    """Push the tip a little at the start of the nonlinear simulation, and see whether that dies away.
 
     Two runs differ by the push alone. It dies away if less of their difference is left in the last third of the time
     than in the second, or next to nothing.
@@ -77,11 +96,18 @@ def push_dies_away(believed: Scene, true: Scene) -> bool:
             runs.append(simulate(each, each.make_plant(), make_controller(believed)))
         except PCRError as error:  # a robot that is lost, or cannot stand at all
             interrupt.pass_on(error)
-            return False
+            ended = runs[0] if runs else error.run if isinstance(error, SimulationError) else None
+            return Pushed(False, ended, str(error))
     tips = np.linalg.norm(runs[0].x[:, :2] - runs[1].x[:, :2], axis=1)
     first, second, last = (float(np.sqrt(np.mean(part**2))) for part in np.array_split(tips, 3))
     largest = float(tips[: len(tips) // 3].max())
-    return last < _LOST * first and (last < second or last < _FLOOR * largest)
+    grown = last >= _LOST * first or last >= _FAR * float(true.robot.lengths.min())
+    return Pushed(not grown and (last < second or last < _FLOOR * largest), runs[0])
+
+
+def push_dies_away(believed: Scene, true: Scene) -> bool:
+    """Whether a small push dies away (see `push`)."""
+    return push(believed, true).dies_away
 
 
 def measure_delay_margin(

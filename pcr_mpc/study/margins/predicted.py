@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ from .search import first_loss
 LONGEST, _PER_PERIOD = 30, 4  # periods of delay that are tried, and steps of each
 _DELAY_TOLERANCE, _FACTOR_TOLERANCE = 1e-3, 2e-3  # of a period; of a factor
 _FACTORS = np.geomspace(1.0, 32.0, 21)  # from one to the next 19 % more
+_STAY = 8  # periods at each pose
 _FREQUENCIES = 400  # from a thousandth of the Nyquist frequency on
 
 
@@ -122,6 +124,16 @@ def delay_margin(loop: LinearLoop) -> float:
     steps = np.arange(LONGEST * _PER_PERIOD + 1) * loop.period / _PER_PERIOD
     return first_loss(lambda time: loop.later(time).spectral_radius() < 1.0, steps.tolist(),
                       _DELAY_TOLERANCE * loop.period)  # fmt: skip
+
+
+def path_radius(loops: Sequence[LinearLoop]) -> float:
+    """Factor by which a small deviation grows in a period on the way along all poses, on the mean, if the way is gone
+    again and again: on a path a loop may be unstable for a moment, and recover."""
+    product = np.eye(len(loops[0].closed().A))
+    for loop in loops:
+        product = np.linalg.matrix_power(loop.closed().A, _STAY) @ product
+    largest = float(np.abs(np.linalg.eigvals(product)).max())
+    return float(largest ** (1.0 / (_STAY * len(loops))))
 
 
 def predict_delay_margin(
