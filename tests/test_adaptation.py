@@ -99,6 +99,7 @@ def test_a_payload_that_nobody_told_of_is_found_and_carried(scene):
     assert done.limit_violations() == 0
 
 
+@pytest.mark.slow
 def test_rods_that_are_softer_than_believed_are_found(scene):
     rods = tuple(replace(rod, bending_stiffness=0.9 * rod.bending_stiffness) for rod in scene.robot.rods)
     softer = replace(scene.robot, rods=rods)
@@ -108,6 +109,7 @@ def test_rods_that_are_softer_than_believed_are_found(scene):
     assert error < 0.4 * plain
 
 
+@pytest.mark.slow
 def test_where_all_is_as_believed_it_does_no_harm(scene):
     plain, _, error = run(untold(scene))
     adapting, adaptation, with_it = run(untold(scene, "tip_mass"))

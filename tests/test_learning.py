@@ -156,6 +156,7 @@ def test_a_lap_gets_hardly_worse_than_the_first(scene, monkeypatch):
     assert laps.max() <= 1.1 * laps[0]
 
 
+@pytest.mark.slow
 def test_what_was_learnt_is_kept_by_another_tuning_and_forgotten_by_a_start(scene):
     scene = learning(scene)
     controller = make_controller(scene)

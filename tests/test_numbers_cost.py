@@ -50,6 +50,7 @@ def test_each_number_alone_by_differences_of_motions(run, known):
         assert cost.by_number[name] == pytest.approx(apart, rel=1e-3), name
 
 
+@pytest.mark.slow
 def test_all_together_by_robots_that_were_drawn(run, known):
     cost = numbers_cost(run, FASTEST, known)
     assert cost.sampled == pytest.approx(cost.error, rel=0.25)  # 48 robots

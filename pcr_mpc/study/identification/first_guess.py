@@ -38,7 +38,8 @@ def noise_of(log: Log, robot: Robot, known: Noise | None = None) -> Noise:
 
     least = _LEAST * float(robot.lengths.mean())
     tip, angle = spread(log.p, least), spread(log.q, _LEAST)
-    return Noise(max(tip, known.tip), max(angle, known.angle)) if known else Noise(tip, angle)
+    torque = spread(log.torque, floor_of(robot).torque) if log.torque is not None else math.inf
+    return Noise(max(tip, known.tip), max(angle, known.angle), torque) if known else Noise(tip, angle, torque)
 
 
 def jumps(log: Log) -> bool:
@@ -50,7 +51,8 @@ def jumps(log: Log) -> bool:
 
 def floor_of(robot: Robot) -> Noise:
     """Least noise that is believed."""
-    return Noise(_LEAST * float(robot.lengths.mean()), _LEAST)
+    length = float(robot.lengths.mean())
+    return Noise(_LEAST * length, _LEAST, _LEAST * robot.force_scale * length)
 
 
 def pieces_of(logs: Sequence[Log], skipped: Sequence[int], length: float | None) -> list[Piece]:

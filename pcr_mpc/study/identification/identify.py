@@ -250,6 +250,10 @@ def _chi2(fits: Sequence[Fit], found: Found, scene: Scene) -> float:
     return total / max(1, count - found.problem.size)
 
 
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
 def _warnings(
     found: Found, estimates: Sequence[Estimate], fits: Sequence[Fit], white: bool, widened: float
 ) -> list[str]:
@@ -267,9 +271,15 @@ def _warnings(
             f"residuals of the tip are not white: the model leaves something out, or noise is coloured; standard "
             f"deviations are widened by {math.sqrt(widened):.2g} for it, and may still be too small"
         )
-    for fit in fits:
+    for i, fit in enumerate(fits):
         if fit.outliers:
             lines.append(f"{fit.log.name}: {fit.outliers} outliers, beyond six standard deviations")
+        if fit.log.torque is not None:
+            rest = found.readings.torque[i]
+            lines.append(
+                f"{fit.log.name}: motor torques tell the scale of forces; they are explained to "
+                f"{_rms(rest):.2g} N m, of {_rms(fit.log.torque):.2g} N m RMS; friction and gears are not in the model"
+            )
         if fit.log.driven_by == "angles":
             lines.append(f"{fit.log.name}: has no commands; the model is driven by the measured angles")
         if count := int(np.isnan(fit.log.u).sum()):

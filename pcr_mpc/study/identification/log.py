@@ -19,6 +19,8 @@ _OFF_GRID = 0.05
 _PAUSE = 20
 # Faster logs are thinned to this rate [1/s]: tips move slowly, and a thousand rows a second cost without telling more.
 _FASTEST = 200.0
+# Columns besides time in which there must be numbers, or nothing.
+_NUMBERS = re.compile(r"(measured_)?(p_[xy]_m|q\d+_rad)|u\d+_rad_s|torque\d+_Nm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,8 @@ class Log(Frozen):
         Motor rates as they were commanded, each held from its row on [rad/s].
     driven_by : {"commands", "angles"}
         Whether ``u`` was recorded, or stands for the angles' differences, which come without a delay.
+    torque : ndarray, shape (M, n), or None
+        Torques of the motors as they were measured, positive counter-clockwise [N m].
     """
 
     name: str
@@ -50,6 +54,7 @@ class Log(Frozen):
     q: np.ndarray
     u: np.ndarray
     driven_by: str = "commands"
+    torque: np.ndarray | None = None
 
     @property
     def missing(self) -> np.ndarray:
@@ -59,7 +64,10 @@ class Log(Frozen):
     def part(self, first: int, last: int, name: str | None = None) -> Log:
         """Return the rows from ``first`` to before ``last``."""
         rows = slice(first, last)
-        return replace(self, name=name or self.name, t=self.t[rows], p=self.p[rows], q=self.q[rows], u=self.u[rows])
+        torque = None if self.torque is None else self.torque[rows]
+        return replace(
+            self, name=name or self.name, t=self.t[rows], p=self.p[rows], q=self.q[rows], u=self.u[rows], torque=torque
+        )
 
 
 def read_log(path: str | Path, n: int) -> list[Log]:
@@ -68,8 +76,8 @@ def read_log(path: str | Path, n: int) -> list[Log]:
     Parameters
     ----------
     path : str or Path
-        A CSV file with the columns ``t_s``, ``p_x_m``, ``p_y_m``, ``q0_rad``, ... and ``u0_rad_s``, ..., in any order
-        and among others; the record of `track`, run.csv or run.npz, or its folder.
+        A CSV file with the columns ``t_s``, ``p_x_m``, ``p_y_m``, ``q0_rad``, ... and ``u0_rad_s``, ..., and perhaps
+        ``torque0_Nm``, ..., in any order and among others; the record of `track`, run.csv or run.npz, or its folder.
     n : int
         Motors of the robot.
 
@@ -115,7 +123,7 @@ def _from_record(path: Path, n: int) -> list[Log]:
 def _from_csv(path: Path, n: int) -> list[Log]:
     columns = _columns(path)
     for name in columns:
-        found = re.fullmatch(r"[qu](\d+)_rad(_s)?", name)
+        found = re.fullmatch(r"(?:[qu]|torque)(\d+)_(?:rad(?:_s)?|Nm)", name)
         if found and int(found[1]) >= n:
             raise _failure(path, f"has a column {name!r}, but the scene's robot has {n} motors; is it another robot's?")
     if "t_s" not in columns:
@@ -124,17 +132,19 @@ def _from_csv(path: Path, n: int) -> list[Log]:
     recorded = any(name.startswith("measured_") for name in columns)
     before = "measured_" if recorded else ""
     nothing = np.full(len(t), np.nan)
-    p, q, u = (
+    p, q, u, torque = (
         np.stack([columns.get(name, nothing) for name in names], axis=1)
         for names in (
             [f"{before}p_{axis}_m" for axis in "xy"],
             [f"{before}q{i}_rad" for i in range(n)],
             [f"u{i}_rad_s" for i in range(n)],
+            # Those in a record of `track` are true ones, which nobody has measured.
+            ["" if recorded else f"torque{i}_Nm" for i in range(n)],
         )
     )
     if recorded:  # of `track`: a row for each step of the plant, with what was measured and told in the period
         rows = _first_rows(t, np.hstack([p, q, u]))
-        t, p, q, u = t[rows], p[rows], q[rows], u[rows]
+        t, p, q, u, torque = t[rows], p[rows], q[rows], u[rows], torque[rows]
     if np.isnan(p).all():
         raise _failure(
             path,
@@ -142,7 +152,7 @@ def _from_csv(path: Path, n: int) -> list[Log]:
         )
     if np.isnan(q).all() and np.isnan(u).all():
         raise _failure(path, "says nothing of the motors: give columns 'u0_rad_s', ..., or at least 'q0_rad', ...")
-    return _on_a_grid(path, t, p, q, u)
+    return _on_a_grid(path, t, p, q, u, torque)
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
@@ -168,7 +178,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
             try:
                 values[k, j] = float(cell) if cell.strip() else np.nan
             except ValueError:
-                if names[j] == "t_s" or re.fullmatch(r"(measured_)?(p_[xy]_m|q\d+_rad)|u\d+_rad_s", names[j]):
+                if names[j] == "t_s" or _NUMBERS.fullmatch(names[j]):
                     raise _failure(path, f"row {k + 2}, column {names[j]!r}: {cell!r} is no number") from None
     values[~np.isfinite(values)] = np.nan
     return dict(zip(names, values.T, strict=True))
@@ -182,7 +192,7 @@ def _first_rows(t: np.ndarray, held: np.ndarray) -> np.ndarray:
     return np.arange(0, len(t) - (len(t) % period == 1), max(period, 1))
 
 
-def _on_a_grid(path: Path, t: np.ndarray, p: np.ndarray, q: np.ndarray, u: np.ndarray) -> list[Log]:
+def _on_a_grid(path: Path, t: np.ndarray, p: np.ndarray, q: np.ndarray, u: np.ndarray, torque: np.ndarray) -> list[Log]:
     """Rows at whole multiples of one step; those that are missing are of NaN, and a long pause divides the log."""
     if np.isnan(t).any():
         raise _failure(path, f"row {int(np.flatnonzero(np.isnan(t))[0]) + 2} has no time")
@@ -206,13 +216,14 @@ def _on_a_grid(path: Path, t: np.ndarray, p: np.ndarray, q: np.ndarray, u: np.nd
     for number, (first, last) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
         places = np.concatenate([[0], np.cumsum(whole[first : last - 1])]).astype(int)
         arrays = []
-        for values in (p, q, u):
+        for values in (p, q, u, torque):
             grid = np.full((places[-1] + 1, values.shape[1]), np.nan)
             grid[places] = values[first:last]
             arrays.append(grid)
         name = f"{path}" if len(ends) == 1 else f"{path} (part {number + 1})"
         times = t[first] + step * np.arange(places[-1] + 1)
-        logs.append(_with_commands(Log(name, step, times, arrays[0], arrays[1], arrays[2])))
+        known = None if np.isnan(arrays[3]).all() else arrays[3]
+        logs.append(_with_commands(Log(name, step, times, arrays[0], arrays[1], arrays[2], torque=known)))
     return logs
 
 
@@ -235,6 +246,9 @@ def _thinned(logs: list[Log]) -> list[Log]:
         if every > 1 and count > 1:
             u = log.u[: count * every].reshape(count, every, -1).mean(axis=1)
             first = slice(0, count * every, every)
-            log = replace(log, step=every * log.step, t=log.t[first], p=log.p[first], q=log.q[first], u=u)
+            torque = None if log.torque is None else log.torque[first]
+            log = replace(
+                log, step=every * log.step, t=log.t[first], p=log.p[first], q=log.q[first], u=u, torque=torque
+            )
         thin.append(log)
     return thin

@@ -65,6 +65,8 @@ def checked_log(log: Log, robot: Robot, pose: Equilibrium) -> Log:
             f"{_LEAST_ROWS} positions at least, better some seconds",
         )
     _check_tip(log, robot, pose.p)
+    if log.torque is not None and (why := robot.needs_shooting):
+        raise _failure(log, f"has motor torques, which are understood of plain rods only, and {why}; leave them out")
     if not np.isnan(log.q).all():
         _check_angles(log, robot)
         log = unwrapped(log, robot, pose.q)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from .parameters import Parameters
 from .prediction import Piece, Predictor
+from .torques import torques_along
 
 # Beyond so many standard deviations Huber's loss grows linearly.
 HUBER = 1.5
@@ -18,10 +20,14 @@ _START = 100.0
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of the readings of a log: of the tip [m] and of the angles [rad]."""
+    """Standard deviations of the readings of a log: of tip [m], angles [rad] and torques [N m].
+
+    An infinite one is of readings that do not count.
+    """
 
     tip: float
     angle: float
+    torque: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +59,14 @@ class Readings:
         Of each log, shapes (M, 2) and (M, n); predicted less measured.
     x : list of ndarray
         Predicted states of each log at its rows, shape (M, 4 + n); NaN where it was not predicted.
+    torque : list of ndarray
+        Residuals of the torques [N m], shape (M, n); NaN also where they do not count.
     """
 
     tip: list[np.ndarray]
     angle: list[np.ndarray]
     x: list[np.ndarray]
+    torque: list[np.ndarray]
 
 
 class Problem:
@@ -172,7 +181,7 @@ class Problem:
     def compared(self, z: np.ndarray, states: Sequence[np.ndarray]) -> Readings:
         """Residuals log by log of the states of all pieces."""
         offsets = self._offsets(z)
-        tips, angles, all_states = [], [], []
+        tips, angles, all_states, torques = [], [], [], []
         for number, log in enumerate(self.predictor.logs):
             x = np.full((len(log.t), 4 + self.predictor.n), np.nan)
             for piece, state in zip(self.pieces, states, strict=True):
@@ -182,7 +191,31 @@ class Problem:
             tips.append((x[:, :2] + offsets[:2] - log.p) / self.noise[number].tip)
             angles.append((x[:, 4:] + offsets[2:] - log.q) / self.noise[number].angle)
             all_states.append(x)
-        return Readings(tips, angles, all_states)
+            off = np.full((len(log.t), self.predictor.n), np.nan)
+            known = ~np.isnan(x).any(axis=1)
+            if log.torque is not None and math.isfinite(self.noise[number].torque):
+                robot = self.parameters.robot_at(z)
+                off[known] = torques_along(robot, x[known], self.predictor.pose).values - log.torque[known]
+            torques.append(off)
+        return Readings(tips, angles, all_states, torques)
+
+    def _of_torques(
+        self, z: np.ndarray, piece: Piece, x: np.ndarray, slope: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals of the torques at states of a piece, and their derivatives."""
+        log, noise = self.predictor.logs[piece.log], self.noise[piece.log]
+        if log.torque is None or not math.isfinite(noise.torque):
+            return np.empty(0), np.empty((0, self.size))
+        found = torques_along(self.parameters.robot_at(z), x, self.predictor.pose)
+        by_all = found.by_state @ slope
+        by_value = np.zeros((*found.values.shape, len(self.parameters.free)))
+        for j, one in enumerate(self.parameters.free):
+            if one.name in found.by_number:
+                by_value[:, :, j] = found.by_number[one.name]
+        by_all[:, :, int(self._at_missing[-1]) :] += by_value @ self.parameters.gradient(z)
+        rest = (found.values - log.torque[piece.first : piece.first + len(x)]) / noise.torque
+        known = ~np.isnan(rest)
+        return rest[known], by_all[known] / noise.torque
 
     def _corrected(self, states: Sequence[np.ndarray]) -> list[np.ndarray]:
         if self.corrections is None:
@@ -210,6 +243,9 @@ class Problem:
             known = ~np.isnan(rest)
             rows.append(rest[known])
             lines.append(by_all[known])
+            more, by_all = self._of_torques(guess.z, piece, x[: len(seen)], slope[: len(seen)])
+            rows.append(more)
+            lines.append(by_all)
         self.n_readings = sum(map(len, rows))
         for i, (piece, x, slope) in enumerate(zip(self.pieces, states, slopes, strict=True)):
             if not piece.joined:

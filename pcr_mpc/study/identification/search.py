@@ -116,7 +116,9 @@ class _Search:
         self.noise = [noise_of(log, parameters.robot) for log in predictor.logs]
         if self.robust:  # what believed numbers leave is no outlier: noise comes down round by round
             least = Noise(_MISFIT * float(parameters.robot.lengths.mean()), _MISFIT)
-            self.noise = [Noise(max(one.tip, least.tip), max(one.angle, least.angle)) for one in self.noise]
+            self.noise = [
+                replace(one, tip=max(one.tip, least.tip), angle=max(one.angle, least.angle)) for one in self.noise
+            ]
         self.corrections: list[np.ndarray] | None = None
         self.whole = length is None or length == LONG
         self.iterations, self.refused = 0, 0
@@ -215,7 +217,10 @@ class _Search:
             new = Noise(
                 max(_spread(tip, self.robust) / math.sqrt(spare), least.tip),
                 max(_spread(angle, self.robust), least.angle) if not np.isnan(log.q).all() else noise.angle,
+                max(_spread(readings.torque[i], self.robust), least.torque) if log.torque is not None else noise.torque,
             )
+            if log.torque is not None:
+                settled &= abs(new.torque / noise.torque - 1.0) < _SETTLED
             settled &= abs(new.tip / noise.tip - 1.0) < _SETTLED and abs(new.angle / noise.angle - 1.0) < _SETTLED
             self.noise[i] = new
         return self._stepped(problem, guess) and settled
