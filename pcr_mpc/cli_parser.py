@@ -236,6 +236,11 @@ def parser() -> argparse.ArgumentParser:
     )
     loop.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
     loop.add_argument("--controller", type=Path, metavar="FILE|NAME", help="tuning instead of the scene's own")
+    for served in (server, loop):
+        served.add_argument("--generated", action="store_true", help="the controller as generated C, which is compiled "
+                            "first, instead of Python's")  # fmt: skip
+    loop.add_argument("--period", type=float, metavar="S", help="control period [s] (default: the scene's); the "
+                      "tuning's weights stay")  # fmt: skip
     loop.add_argument("--duration", type=float, metavar="S", help="of the run [s] (default: the scene's)")
     loop.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default results/hil/NAME)")
 

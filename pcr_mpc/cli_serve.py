@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from .control.tuning import load_tuning
@@ -16,21 +17,24 @@ from .loop.scene_file import load_scene
 
 def _scene(options: argparse.Namespace) -> Scene:
     scene = load_scene(options.scene)
-    return scene.tuned(load_tuning(options.controller)) if options.controller else scene
+    tuning = load_tuning(options.controller) if options.controller else scene.tuning
+    period = getattr(options, "period", None)
+    if tuning is not None and period is not None:
+        tuning = replace(tuning, period=period)
+    return scene if tuning is None else scene.tuned(tuning)
 
 
 def serve(options: argparse.Namespace) -> int:
     """Run `pcr-mpc serve`."""
-    from .wire.decider import Decider
+    from .wire.decider import make_decider
     from .wire.server import Server
 
     host, colon, port = options.listen.rpartition(":")
     if not (colon and port.isdigit()):
         raise ValueError(f"--listen is {options.listen!r}, expected HOST:PORT such as 127.0.0.1:5005")
     scene = _scene(options)
-    server = Server(
-        Decider(scene), (host or "127.0.0.1", int(port)), silence=options.silence, anywhere=options.anywhere
-    )
+    decider = make_decider(scene, generated=options.generated)
+    server = Server(decider, (host or "127.0.0.1", int(port)), silence=options.silence, anywhere=options.anywhere)
 
     def tell(text: str) -> None:
         print(f"{scene.name}: {text}", file=sys.stderr, flush=True)
@@ -54,8 +58,6 @@ def serve(options: argparse.Namespace) -> int:
 
 def hil(options: argparse.Namespace) -> int:
     """Run `pcr-mpc hil`."""
-    from dataclasses import replace
-
     from .report.hil import hil_table, plot_hil
     from .wire.hil import run_hil
 
@@ -63,7 +65,7 @@ def hil(options: argparse.Namespace) -> int:
     if options.duration is not None:
         scene = replace(scene, duration=options.duration)
     folder = options.out or Path("results") / "hil" / scene.name
-    found = run_hil(scene, progress=True)
+    found = run_hil(scene, generated=options.generated, progress=True)
 
     def write(where: Path) -> None:
         with results(where) as staged:

@@ -1,5 +1,6 @@
 """Packets, and the server that answers them: what is none moves no motor, and silence brings them to rest."""
 
+import shutil
 import socket
 import struct
 import threading
@@ -14,7 +15,7 @@ from pcr_mpc.control.tuning import Limits
 from pcr_mpc.errors import OutputError, PCRError
 from pcr_mpc.loop.parts import resting_state
 from pcr_mpc.loop.scene_file import load_scene
-from pcr_mpc.wire.decider import Decider
+from pcr_mpc.wire.decider import make_decider
 from pcr_mpc.wire.hil import run_hil
 from pcr_mpc.wire.packet import (
     RESTING,
@@ -182,9 +183,13 @@ def test_the_loop_over_a_socket(server):
 
 
 @pytest.mark.slow
-def test_a_scene_is_tracked_through_packets():
+@pytest.mark.parametrize("generated", [False, True])
+def test_a_scene_is_tracked_through_packets(generated):
+    if generated and not (shutil.which("make") and shutil.which("cc")):
+        pytest.skip("generated C is compiled here: needs cc and make")
     scene = load_scene(ROOT / "models" / "scenes" / "lemniscate.toml")
-    decider, pose, plant = Decider(scene), scene.start(), scene.make_plant()
+    decider = make_decider(scene, generated=generated)
+    pose, plant = scene.start(), scene.make_plant()
     server, x = Server(decider, ("127.0.0.1", 0)), resting_state(pose)
     plant.reset(x, pose)
     wanted = scene.trajectory(0.01 * np.arange(101))[:, 0]

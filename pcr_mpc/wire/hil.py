@@ -104,8 +104,8 @@ def _percentiles(times: np.ndarray) -> dict[str, float]:
     return {name: 1e6 * float(np.percentile(times, share)) for name, share in shares.items()}
 
 
-def run_hil(scene: Scene, *, progress: bool = False) -> HilRun:
-    """Run a scene in real time, the controller behind UDP.
+def run_hil(scene: Scene, *, generated: bool = False, progress: bool = False) -> HilRun:
+    """Run a scene in real time, the controller behind UDP, in Python or as generated C.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def run_hil(scene: Scene, *, progress: bool = False) -> HilRun:
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_controller, args=(scene, theirs), daemon=True)
+    process = context.Process(target=_controller, args=(scene, generated, theirs), daemon=True)
     process.start()
     try:
         address = _expected(ours, process)
@@ -164,13 +164,13 @@ def _expected(pipe: Connection, process: Any) -> Any:
     raise PCRError("the controller's process has ended or does not answer; try `pcr-mpc serve` to see why")
 
 
-def _controller(scene: Scene, pipe: Connection) -> None:
+def _controller(scene: Scene, generated: bool, pipe: Connection) -> None:
     """The other process."""
-    from .decider import Decider
+    from .decider import make_decider
     from .server import Server
 
     try:
-        server = Server(Decider(scene), ("127.0.0.1", 0))
+        server = Server(make_decider(scene, generated=generated), ("127.0.0.1", 0))
     except Exception as error:  # whatever it is, who waits is told
         pipe.send(error)
         return
