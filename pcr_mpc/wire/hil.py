@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
+import select
 import socket
 import sys
 import time
@@ -26,6 +28,7 @@ from .packet import RESTING, Measurement, command_size, pack_measurement, unpack
 
 _PATIENCE = 120.0  # s, until the controller's process listens
 _HEAD_START = 0.05  # s
+_SILENCE, _SILENCE_TIME = 5, 0.05  # periods at least, and s
 _SPIN = 1e-4  # s before a step is due, in which sleeping is too coarse
 
 
@@ -131,8 +134,8 @@ def run_hil(scene: Scene, *, generated: bool = False, progress: bool = False) ->
             process.terminate()
     t, error, late, round_trip, rungs, dt = plant_log
     came = round_trip[~np.isnan(round_trip)]
-    # A command acts at the first step that begins after it has come, which is when it is seen.
-    delay = dt * float(np.mean(np.floor(came / dt))) if len(came) else 0.0
+    # A command acts at the first step that begins after it has come.
+    delay = dt * float(np.mean(np.ceil(came / dt))) if len(came) else 0.0
     return HilRun(scene, dt, t, error, late, round_trip, rungs, _simulated(scene, delay), delay, counts, priority)
 
 
@@ -169,8 +172,10 @@ def _controller(scene: Scene, generated: bool, pipe: Connection) -> None:
     from .decider import make_decider
     from .server import Server
 
+    # A process that is kept waiting by others for some milliseconds has not fallen silent.
+    silence = max(_SILENCE, math.ceil(_SILENCE_TIME / scene.period))
     try:
-        server = Server(make_decider(scene, generated=generated), ("127.0.0.1", 0))
+        server = Server(make_decider(scene, generated=generated), ("127.0.0.1", 0), silence=silence)
     except Exception as error:  # whatever it is, who waits is told
         pipe.send(error)
         return
@@ -205,7 +210,13 @@ def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[A
         began = time.perf_counter() + _HEAD_START
         for step in range(count):
             due = began + step * plant.dt
-            _sleep_until(due)
+            for data, now in _until(due, wire, command_size(n) + 1):
+                command = unpack_command(data, n)
+                if command is None or command.sequence >= len(sent):
+                    continue
+                u, k = command.u, command.sequence
+                if command.rung != RESTING and k == (step - 1) // per:
+                    round_trip[k], rungs[k] = now - sent[k], command.rung
             late[step] = time.perf_counter() - due
             if step % per == 0:
                 interrupt.check()
@@ -215,14 +226,6 @@ def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[A
                 sent[k] = time.perf_counter()
                 _quietly(wire.send, pack_measurement(Measurement(k, t[step], p, q)))
                 bar.update()
-            while data := _quietly(wire.recv, command_size(n) + 1):
-                command = unpack_command(data, n)
-                if command is None or command.sequence >= len(sent):
-                    continue
-                u = command.u
-                taken = time.perf_counter() - sent[command.sequence]
-                if command.rung != RESTING and command.sequence == step // per and np.isnan(round_trip[step // per]):
-                    round_trip[step // per], rungs[step // per] = taken, command.rung
             try:
                 x = plant.step(x, u, scene.force)
             except PCRError as error:
@@ -234,10 +237,17 @@ def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[A
     return t, np.hypot(*(tips - wanted).T), late, round_trip, rungs, plant.dt
 
 
-def _sleep_until(due: float) -> None:
-    while (left := due - time.perf_counter()) > 0.0:
-        if left > _SPIN:
-            time.sleep(left - _SPIN)
+def _until(due: float, wire: socket.socket, size: int) -> Iterator[tuple[bytes, float]]:
+    """Datagrams that come until a time, and when each came; the last moments are waited for awake."""
+    while True:
+        data = _quietly(wire.recv, size)
+        now = time.perf_counter()
+        if data is not None:
+            yield data, now
+        elif now >= due:
+            return
+        elif due - now > _SPIN:
+            select.select([wire], [], [], due - now - _SPIN)
 
 
 def _quietly(call: Any, *arguments: Any) -> Any:
