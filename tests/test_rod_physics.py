@@ -19,10 +19,12 @@ from pcr_mpc import (
     simulate,
     solve_statics,
 )
+from pcr_mpc.plant.rods.elastica import tip_map
 from pcr_mpc.plant.rods.equations import Layout, RodPhysics, propagation, sample_rod
 from pcr_mpc.plant.rods.multiple_shooting import rod_newton
 from pcr_mpc.plant.rods.physics import robot_physics
 from pcr_mpc.plant.statics.stability import count_conjugate_points
+from pcr_mpc.plant.statics.weight import _rod_weight
 
 from .conftest import MODELS
 
@@ -206,6 +208,23 @@ def test_condensed_weight_has_a_potential(vertical, hanging):
     plant = condensed(tilted, hanging)
     eq = plant.equilibrium(np.concatenate([hanging.p, [0, 0], hanging.q]))
     check_derivatives(eq, lambda p, q: plant.equilibrium(np.concatenate([p, [0, 0], q])))
+
+
+@pytest.mark.parametrize(("load", "over"), [(3.0, 2.0), (20.0, 1.5), (200.0, 1.0), (600.0, 1.0)])
+def test_second_derivatives_of_the_condensed_weight(load, over):
+    """They are symmetric, and turning rod and gravity together changes nothing but the frame; taut rods too."""
+    first, second = _rod_weight()
+    for hand, angle, down in ((1.0, 0.4, (0.3, -1.0)), (-1.0, -2.0, (1.0, 0.2))):
+        unknowns = [over - load if load > 10 else np.log(over), load, hand]
+        (x, y), *_ = (part.full().ravel() for part in tip_map()(unknowns[:2]))
+        tip = np.array([np.cos(angle) * x - hand * np.sin(angle) * y, np.sin(angle) * x + hand * np.cos(angle) * y])
+        quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
+        slope, turned = (first(unknowns, angle, g)[1].full().ravel() for g in (down, quarter @ down))
+        curvature = second(unknowns, angle, down).full()
+        size = np.abs(curvature).max()
+        assert curvature == pytest.approx(curvature.T, abs=1e-7 * size)
+        left = curvature[:, :2] @ quarter @ tip + curvature[:, 2] + turned
+        assert left == pytest.approx(np.append(quarter @ slope[:2], 0.0), abs=1e-8 * size)
 
 
 def test_condensed_weight_is_exact_to_first_order(vertical, hanging):

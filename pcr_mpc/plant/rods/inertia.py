@@ -23,7 +23,7 @@ import numpy as np
 from scipy.special import roots_jacobi
 
 from ...buffered import graph_cache
-from .pendulum import elliptic
+from .pendulum import elliptic, swing
 
 INERTIAS = ("none", "constant", "condensed", "full")
 # Points along a rod, beside the tip: 1e-5 of its inertia (1e-3 of the smallest entries) where rods are bent like those
@@ -31,40 +31,48 @@ INERTIAS = ("none", "constant", "condensed", "full")
 _POINTS = 6
 # Enough for k > 0.01, that is for all but straight rods pushed along their axis.
 _LANDEN_STEPS = 5
+# Logarithm of a tip angle beside which what is explicit in it is nothing.
+_SMALLEST = -300.0
 
 
-class _Point:
-    """F = (C, -Y) and delta at u with their derivatives in a = log(alpha) and u: tip to point, seen along the force."""
+class Point:
+    """F = (C, -Y) and delta at u with their derivatives in a = log(alpha) and u: tip to point, seen along the force.
 
-    def __init__(self, log_tip_angle: Any, u: Any) -> None:
-        alpha = ca.exp(log_tip_angle)
+    Right up to a = -300, and beyond with ``any_pull``; see `pendulum`.
+    """
+
+    def __init__(self, log_tip_angle: Any, u: Any, *, any_pull: bool = False) -> None:
+        alpha = ca.exp(ca.fmax(log_tip_angle, _SMALLEST) if any_pull else log_tip_angle)
         k, k_prime = ca.cos(alpha / 2), ca.sin(alpha / 2)
-        sn, cn, dn, d = elliptic(u, k, k_prime, _LANDEN_STEPS)
-        half_sin, half_cos = k_prime / dn, k * cn / dn
-        sin, cos = 2 * half_sin * half_cos, 1 - 2 * half_sin**2
+        if any_pull:
+            (cos, sin, y, c), half = swing(log_tip_angle, u, any_pull=True)
+            w = u * ca.cos(alpha) - c
+        else:
+            sn, cn, dn, d = elliptic(u, k, k_prime, _LANDEN_STEPS)
+            half = k_prime / dn, k * cn / dn
+            sin, cos = 2 * half[0] * half[1], 1 - 2 * half[0] ** 2
+            y, w = 2 * k * sn * half[0], 2 * (d - k_prime**2 * u)
         sin_alpha, cos_alpha = 2 * k * k_prime, 1 - 2 * k_prime**2
-        y, w = 2 * k * sn * half_sin, 2 * (d - k_prime**2 * u)
-        over, cot = 1 / (2 * sin_alpha), cos_alpha / sin_alpha
+        over = alpha / (2 * sin_alpha)
+        pull, damp = u * alpha * sin_alpha, 1 - alpha * cos_alpha / sin_alpha
         eta = (2 * sin + w * y) * over
-        y_1 = (2 * cos * y + y**3 / 2 + w * sin) * over
-        c_1 = -(u * sin_alpha + y * eta) / 2
-        w_1 = (y * eta - u * sin_alpha) / 2
-        eta_1 = (2 * cos * eta + w_1 * y + w * y_1) * over - cot * eta
-        y_2 = ((2 * cos + 1.5 * y**2) * y_1 - 2 * sin * eta * y + w_1 * sin + w * cos * eta) * over - cot * y_1
-        c_2 = -(u * cos_alpha + y_1 * eta + y * eta_1) / 2
+        y_a = (2 * cos * y + y**3 / 2 + w * sin) * over
+        w_a = (y * eta - pull) / 2
+        eta_a = (2 * cos * eta + w_a * y + w * y_a) * over + damp * eta
+        y_aa = ((2 * cos + 1.5 * y**2) * y_a - 2 * sin * eta * y + w_a * sin + w * cos * eta) * over + damp * y_a
+        c_aa = -(pull + u * alpha**2 * cos_alpha + y_a * eta + y * eta_a) / 2
         self.f = ca.vertcat(u * cos_alpha - w, -y)
-        self.f_a = alpha * ca.vertcat(c_1, -y_1)
+        self.f_a = ca.vertcat(-(pull + y * eta) / 2, -y_a)
         self.f_u = ca.vertcat(cos, -sin)
-        self.f_aa = self.f_a + alpha**2 * ca.vertcat(c_2, -y_2)
-        self.f_au = -alpha * eta * ca.vertcat(sin, cos)
+        self.f_aa = ca.vertcat(c_aa, -y_aa)
+        self.f_au = -eta * ca.vertcat(sin, cos)
         self.f_uu = -y * ca.vertcat(sin, cos)
-        self.delta = 2 * ca.atan2(half_sin, half_cos)
-        self.delta_a, self.delta_u = alpha * eta, y
-        self.delta_aa = alpha * eta + alpha**2 * eta_1
-        self.delta_au, self.delta_uu = alpha * y_1, sin
+        self.delta = 2 * ca.atan2(*half)
+        self.delta_a, self.delta_u = eta, y
+        self.delta_aa, self.delta_au, self.delta_uu = eta_a, y_a, sin
 
 
-def _along(base: _Point, point: _Point | None, sigma: float, load: Any) -> list[Any]:
+def along(base: Point, point: Point | None, sigma: float, load: Any) -> list[Any]:
     """Base to point, in L, and its derivatives: [g, g_a, g_l, g_aa, g_al, g_ll], l = lambda, u = lambda sigma.
 
     None: the tip itself.
@@ -93,7 +101,8 @@ def _quadrature(n_points: int) -> tuple[np.ndarray, np.ndarray]:
     return np.append(1 - x, 0.0), np.append(weights, 1 / 3 - weights @ x**2)
 
 
-def _turned(vector: Any) -> Any:
+def turned(vector: Any) -> Any:
+    """Turn to the left by a right angle."""
     return ca.vertcat(-vector[1], vector[0])
 
 
@@ -103,11 +112,11 @@ def _moments(shape: list[Any]) -> tuple[list[Any], list[list[Any]]]:
     second = [[shape[3], shape[4]], [shape[4], shape[5]]]
     pairs = [(0, 0), (0, 1), (1, 1)]
     values = [ca.dot(first[i], first[j]) for i, j in pairs]
-    values += [ca.dot(first[i], _turned(g)) for i in (0, 1)] + [ca.dot(g, g)]
+    values += [ca.dot(first[i], turned(g)) for i in (0, 1)] + [ca.dot(g, g)]
     slopes = []
     for k in (0, 1):
         slope = [ca.dot(second[i][k], first[j]) + ca.dot(first[i], second[j][k]) for i, j in pairs]
-        slope += [ca.dot(second[i][k], _turned(g)) + ca.dot(first[i], _turned(first[k])) for i in (0, 1)]
+        slope += [ca.dot(second[i][k], turned(g)) + ca.dot(first[i], turned(first[k])) for i in (0, 1)]
         slopes.append([*slope, 2 * ca.dot(g, first[k])])
     return values, slopes
 
@@ -123,12 +132,12 @@ def rod_mass() -> Any:
     """
     unknowns, angle = ca.SX.sym("unknowns", 3), ca.SX.sym("angle")
     log_tip_angle, load, hand = ca.vertsplit(unknowns)
-    base = _Point(log_tip_angle, load)
-    tip = _along(base, None, 0.0, load)
+    base = Point(log_tip_angle, load)
+    tip = along(base, None, 0.0, load)
     moments, slopes = ca.SX(6, 1), ca.SX(6, 2)
     for sigma, weight in zip(*_quadrature(_POINTS), strict=True):
-        point = _Point(log_tip_angle, load * sigma) if sigma else None
-        values, changes = _moments(_along(base, point, sigma, load))
+        point = Point(log_tip_angle, load * sigma) if sigma else None
+        values, changes = _moments(along(base, point, sigma, load))
         moments += weight * ca.vertcat(*values)
         slopes += weight * ca.horzcat(*(ca.vertcat(*change) for change in changes))
 
@@ -136,13 +145,8 @@ def rod_mass() -> Any:
     known = ca.vertcat(*tip[:3], base.delta_a, base.delta_u)
     z = ca.SX.sym("z", known.numel() + 6)
     at_tip, tip_a, tip_l, psi_y, m = z[0:2], z[2:4], z[4:6], z[6:8], z[8:14]
-    jacobian = ca.horzcat(tip_a + psi_y[0] * _turned(at_tip), tip_l + psi_y[1] * _turned(at_tip))
-    determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
-    inverse = ca.vertcat(
-        ca.horzcat(jacobian[1, 1], -jacobian[0, 1]), ca.horzcat(-jacobian[1, 0], jacobian[0, 0])
-    ) / determinant  # fmt: skip
-    rates = ca.horzcat(inverse, -inverse @ _turned(at_tip))
-    whole = ca.vertcat(rates, psi_y.T @ rates + ca.horzcat(0, 0, 1))
+    whole = by_pose_of_tip(at_tip, tip_a, tip_l, psi_y)
+    rates = whole[:2, :]
     mass = _upper(whole.T @ _symmetric(m) @ whole)
     by_y = ca.horzcat(
         ca.jtimes(mass, z, ca.vertcat(tip[1], tip[3], tip[4], base.delta_aa, base.delta_au, slopes[:, 0])),
@@ -156,12 +160,28 @@ def rod_mass() -> Any:
 
     # To the world; a right-handed rod is the mirror image: y, q and their rates change sign.
     psi = hand * angle + base.delta
-    cos, sin = ca.cos(psi), ca.sin(psi)
-    view = ca.diagcat(ca.vertcat(ca.horzcat(cos, hand * sin), ca.horzcat(-sin, hand * cos)), hand)
+    view = seen_along_force(psi, hand)
     by_pose = by_pose @ view
     in_world = [_symmetric(_upper(view.T @ _symmetric(column) @ view)) for column in [mass, *ca.horzsplit(by_pose)]]
     results = [in_world[0], ca.horzcat(*(ca.vec(slope) for slope in in_world[1:]))]
     return ca.Function("rod_mass", [unknowns, angle], [ca.densify(result) for result in results], {"cse": True})
+
+
+def by_pose_of_tip(at_tip: Any, tip_a: Any, tip_l: Any, psi_y: Any) -> Any:
+    """Rates (3, 3) of (a, l, psi) by those of the tip, seen along the force, and of the clamp."""
+    jacobian = ca.horzcat(tip_a + psi_y[0] * turned(at_tip), tip_l + psi_y[1] * turned(at_tip))
+    determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+    inverse = ca.vertcat(
+        ca.horzcat(jacobian[1, 1], -jacobian[0, 1]), ca.horzcat(-jacobian[1, 0], jacobian[0, 0])
+    ) / determinant  # fmt: skip
+    rates = ca.horzcat(inverse, -inverse @ turned(at_tip))
+    return ca.vertcat(rates, psi_y.T @ rates + ca.horzcat(0, 0, 1))
+
+
+def seen_along_force(psi: Any, hand: Any) -> Any:
+    """(p, q) from the world (3, 3); a right-handed rod is the mirror image."""
+    cos, sin = ca.cos(psi), ca.sin(psi)
+    return ca.diagcat(ca.vertcat(ca.horzcat(cos, hand * sin), ca.horzcat(-sin, hand * cos)), hand)
 
 
 def _upper(matrix: Any) -> Any:

@@ -19,8 +19,8 @@ import numpy as np
 
 from ...buffered import BufferedFunction, graph_cache
 from ..robot import Robot
+from ..rods.inertia import Point, along, by_pose_of_tip, seen_along_force, turned
 from ..rods.numbers import Kind
-from ..rods.pendulum import pendulum
 from .equilibrium import Equilibrium
 
 WEIGHTS = ("none", "condensed", "exact")
@@ -82,30 +82,33 @@ def _rod_weight() -> tuple[Any, Any]:
         Same arguments -> d2U_g / d(p, q)2 (3, 3).
     """
     unknowns, angle, down = ca.SX.sym("unknowns", 3), ca.SX.sym("angle"), ca.SX.sym("down", 2)
-    moving, hand, pose = unknowns[:2], unknowns[2], ca.SX.sym("pose", 3)
-    load = unknowns[1]
-    delta, rate, c = pendulum(unknowns[0], load, any_pull=True)
-    cos, sin = ca.cos(delta), ca.sin(delta)
-
-    def seen_from_clamp(along: Any, across: Any) -> Any:
-        return ca.vertcat(cos * along + sin * across, sin * along - cos * across) / load
-
-    mean = ca.SX(2, 1)
-    for x, weight in zip(*np.polynomial.legendre.leggauss(_POINTS), strict=True):
-        _, rate_there, c_there = pendulum(unknowns[0], load * (1 - x) / 2, any_pull=True)
-        mean += weight / 2 * seen_from_clamp(c - c_there, rate - rate_there)
-    turn = ca.vertcat(
-        ca.horzcat(ca.cos(pose[2]), ca.sin(pose[2])), hand * ca.horzcat(-ca.sin(pose[2]), ca.cos(pose[2]))
+    log_tip_angle, load, hand = ca.vertsplit(unknowns)
+    base = Point(log_tip_angle, load, any_pull=True)
+    tip = along(base, None, 0.0, load)
+    mean = [ca.SX(2, 1)] * len(tip)
+    for x, share in zip(*np.polynomial.legendre.leggauss(_POINTS), strict=True):
+        sigma = (1 - x) / 2
+        there = along(base, Point(log_tip_angle, load * sigma, any_pull=True), sigma, load)
+        mean = [so_far + share / 2 * part for so_far, part in zip(mean, there, strict=True)]
+    view = seen_along_force(hand * angle + base.delta, hand)
+    e = view[:2, :2] @ down
+    # U = -e . mean, where e turns back as psi grows; (a, l, psi) follow (p, q).
+    whole = by_pose_of_tip(*tip[:3], ca.vertcat(base.delta_a, base.delta_u))
+    seen = whole.T @ ca.vertcat(-ca.dot(e, mean[1]), -ca.dot(e, mean[2]), ca.dot(turned(e), mean[0]))
+    # Second derivatives of U less (p, q) times its slopes: how (a, l, psi) bend over (p, q) drops out.
+    both = [
+        ca.vertcat(ca.dot(e, m) + ca.dot(seen[:2], t), ca.dot(turned(e), m) + ca.dot(turned(seen[:2]), t))
+        for m, t in zip(mean, tip, strict=True)
+    ]
+    aa, al, ll = (
+        seen[2] * slope - part[0]
+        for slope, part in zip((base.delta_aa, base.delta_au, base.delta_uu), both[3:], strict=True)
     )
-    energy = -ca.dot(turn @ down, mean)
-    # The unknowns keep the tip, seen from the clamp, where the pose puts it.
-    missed = seen_from_clamp(c, rate) - turn @ pose[:2]
-    moves = -ca.solve(ca.jacobian(missed, moving), ca.jacobian(missed, pose))
-    slope = (ca.jacobian(energy, moving) @ moves + ca.jacobian(energy, pose)).T
-    curvature = ca.jacobian(slope, moving) @ moves + ca.jacobian(slope, pose)
-    tip = turn.T @ seen_from_clamp(c, rate)  # turn is orthogonal
-    results = ca.substitute([energy, slope, curvature], [pose], [ca.vertcat(tip, angle)])
-    results = ca.substitute(results, [pose], [ca.vertcat(tip, angle)])  # turn in the tip holds the angle
+    bent = ca.vertcat(
+        ca.horzcat(aa, al, both[1][1]), ca.horzcat(al, ll, both[2][1]), ca.horzcat(both[1][1], both[2][1], both[0][0])
+    )
+    along_force = whole @ view
+    results = [-ca.dot(e, mean[0]), view.T @ seen, along_force.T @ bent @ along_force]
     arguments, options = [unknowns, angle, down], {"cse": True}
     return (
         ca.Function("rod_weight", arguments, [ca.densify(r) for r in results[:2]], options),
@@ -117,20 +120,20 @@ def _rod_weight() -> tuple[Any, Any]:
 def robot_weight(kind: Kind) -> tuple[Any, Any]:
     """Graphs of plain rods: (unknowns (3, n), q (n), numbers) -> U_g [J], dU_g/d(p, q) (2 + n); second derivatives."""
     n = kind.n_rods
-    unknowns, q, vector = ca.SX.sym("unknowns", 3, n), ca.SX.sym("q", n), ca.SX.sym("numbers", kind.size)
+    # Rods as calls: twice as quick to compile as one list of instructions.
+    unknowns, q, vector = ca.MX.sym("unknowns", 3, n), ca.MX.sym("q", n), ca.MX.sym("numbers", kind.size)
     numbers = kind.unpack(vector)
-    energy, slope, curvature = ca.SX(1, 1), ca.SX(2 + n, 1), ca.SX(2 + n, 2 + n)
+    energy, slope, curvature = ca.MX(0), ca.MX(ca.DM.zeros(2 + n)), ca.MX(ca.DM.zeros(2 + n, 2 + n))
     first, second = _rod_weight()
     for i, rod in enumerate(numbers.rods):
         known = unknowns[:, i], q[i], rod.line_density * rod.length * numbers.gravity
-        by_pose = ca.diag(ca.vertcat(1 / rod.length, 1 / rod.length, 1))
-        own = [0, 1, 2 + i]
+        own = ca.DM.eye(2 + n)[[0, 1, 2 + i], :]
+        by_pose = ca.diag(ca.vertcat(1 / rod.length, 1 / rod.length, 1)) @ own
         of_rod, slope_of_rod = first(*known)
         energy += rod.length * of_rod
-        slope[own] += rod.length * by_pose @ slope_of_rod
-        curvature[own, own] += rod.length * by_pose @ second(*known) @ by_pose
-    options = {"cse": True}
+        slope += rod.length * by_pose.T @ slope_of_rod
+        curvature += rod.length * by_pose.T @ second(*known) @ by_pose
     return (
-        ca.Function("weight", [unknowns, q, vector], [energy, ca.densify(slope)], options),
-        ca.Function("weight_slope", [unknowns, q, vector], [ca.densify(curvature)], options),
+        ca.Function("weight", [unknowns, q, vector], [energy, ca.densify(slope)]),
+        ca.Function("weight_slope", [unknowns, q, vector], [ca.densify(curvature)]),
     )
