@@ -93,7 +93,7 @@ def _rod_weight() -> tuple[Any, Any]:
     view = seen_along_force(hand * angle + base.delta, hand)
     e = view[:2, :2] @ down
     # U = -e . mean, where e turns back as psi grows; (a, l, psi) follow (p, q).
-    whole = by_pose_of_tip(*tip[:3], ca.vertcat(base.delta_a, base.delta_u))
+    whole = by_pose_of_tip(tip[0], tip[1], tip[2], ca.vertcat(base.delta_a, base.delta_u))
     seen = whole.T @ ca.vertcat(-ca.dot(e, mean[1]), -ca.dot(e, mean[2]), ca.dot(turned(e), mean[0]))
     # Second derivatives of U less (p, q) times its slopes: how (a, l, psi) bend over (p, q) drops out.
     both = [
