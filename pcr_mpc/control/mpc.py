@@ -330,6 +330,4 @@ def _another_robot(one: LinearModel, other: LinearModel) -> bool:
 
 
 def _shifted(inputs: np.ndarray) -> np.ndarray:
-    shifted = np.empty_like(inputs)
-    shifted[:-1], shifted[-1] = inputs[1:], inputs[-1]
-    return shifted
+    return np.concatenate((inputs[1:], inputs[-1:]))

@@ -14,6 +14,7 @@ from .daqp_solver import DAQPSolver
 from .limited_qp import Limited, LimitedQP, active_of
 from .osqp_solver import QPSolver
 from .qp import QuadraticProgram, constraint_matrix, motor_bounds
+from .qp_solver import Solution
 from .tuning import Limits, Tuning, time_unit
 
 _RATES = ("rate", "rate change")
@@ -89,7 +90,7 @@ class Workspace:
                 found = solver.solve(certified=False)
                 inputs, y = (found.x, found.y) if plain else (rate * found.x, found.y / rate)
                 primal, dual, broken, of_rates, of_changes, kept = check(inputs, y)
-                found = found._replace(primal_residual=primal / rate, dual_residual=rate * dual)
+                found = Solution(found.x, found.y, found.iterations, found.run_time, primal / rate, rate * dual)
                 solver.judge(found)
             except InfeasibleError as error:
                 self._count(error)

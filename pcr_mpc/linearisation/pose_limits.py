@@ -96,6 +96,14 @@ class LimitWatch(Remade):
         n = robot.n_rods
         self._counts = dict(zip(KINDS, (n, 2, n, 1, self._strain.count), strict=True))
         self._moment_units = robot.stiffnesses / robot.lengths
+        # See `far`; what is not limited is never near.
+        margin = limits.rod_margin
+        self._watched = (
+            limits.tip_lower is not None,
+            math.inf if limits.torque is None else _TORQUE_WATCHED * limits.torque,
+            -math.inf if limits.stiffness is None else _STIFFNESS_WATCHED * limits.stiffness,
+            math.inf if margin is None else (1.0 - margin - _MARGIN_WATCHED) * LEAST_CRITICAL_LOAD,
+        )
         # What takes long at first is not left to the first limit that comes near.
         if limits.rod_margin is not None:
             critical_load(0.0)
@@ -130,20 +138,14 @@ class LimitWatch(Remade):
         ``signs`` are the least eigenvalue of K [N/m], torques [N m], and log tip angles and loads of the rods (see
         `elastica`); NaN is not far.
         """
-        limits, n = self.limits, (len(signs) - 1) // 3
-        if limits.tip_lower is not None or (self._strain.count and not self._strain.far(signs[1 + 2 * n :])):
+        never, torque, stiffness, load = self._watched
+        loads = signs[1 + 2 * self._robot.n_rods :]
+        if never or not signs[0] > stiffness or not self._strain.far(loads):
             return False
-        if limits.torque is not None:
-            watched = _TORQUE_WATCHED * limits.torque
-            for torque in signs[1 : 1 + n]:
-                if not -watched < torque < watched:
-                    return False
-        if limits.stiffness is not None and not signs[0] > _STIFFNESS_WATCHED * limits.stiffness:
-            return False
-        if limits.rod_margin is None:
-            return True
-        near = (1.0 - limits.rod_margin - _MARGIN_WATCHED) * LEAST_CRITICAL_LOAD
-        return max(signs[1 + 2 * n :]) <= near
+        for found in signs[1 : 1 + self._robot.n_rods]:
+            if not -torque < found < torque:
+                return False
+        return max(loads) <= load
 
     def recall(self, record: np.ndarray) -> None:
         """Tell the plant where its rods are (see `Plant.recall`)."""

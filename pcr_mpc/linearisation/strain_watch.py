@@ -44,6 +44,7 @@ class StrainWatch:
         self._physics: tuple[RodPhysics, ...] | None = physics
         self._at_nodes: dict[int, BufferedFunction] = {}
         self._ratios = [rod.thickness_ratio or math.nan for rod in plant.robot.rods]
+        self._far = [(i, self._ratios[i], _WATCHED * limit) for i, limit in self._rods]
 
     @property
     def count(self) -> int:
@@ -52,7 +53,7 @@ class StrainWatch:
 
     def far(self, loads: list[float]) -> bool:
         """Whether no rod in closed form with these loads (see `elastica`) can be near its limit: |m| <= 2 lambda."""
-        return all(2.0 * loads[i] * self._ratios[i] < _WATCHED * limit for i, limit in self._rods)
+        return all(2.0 * loads[i] * ratio < watched for i, ratio, watched in self._far)
 
     def rows(self, x: np.ndarray, state: RobotState) -> Rows | None:
         """C, lower, upper and scale as of `LinearLimits`; None if no strain is near its limit."""

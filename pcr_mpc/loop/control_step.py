@@ -96,7 +96,7 @@ class ControlStep:
     @property
     def expected(self) -> np.ndarray:
         """State that is expected at the next step, shape (4 + n,)."""
-        return np.asarray(self.foresight.inputs["estimate"][:-2])
+        return self.foresight.expected
 
     def restart(self, pose: Equilibrium, resting: LinearModel, delay: int) -> None:
         """Forget all periods: the robot rests in ``pose``, about which ``resting`` is the linear model.
@@ -105,7 +105,7 @@ class ControlStep:
         """
         x = resting_state(pose)
         self.foresight.reset(x, pose)
-        self.foresight.inputs["estimate"][:-2] = x
+        self.foresight.expected[:] = x
         if self.observer is not None:
             self.observer.start(x)
         if self.past is not None:
@@ -151,7 +151,7 @@ class ControlStep:
     def pass_by(self, count: int) -> None:
         """Reckon ``count`` periods without a step, in which the motors were told nothing new."""
         foresight = self.foresight
-        x, force = self.expected.copy(), foresight.inputs["estimate"][-2:].copy()
+        x, force = self.expected.copy(), foresight.force.copy()
         robot = foresight.plant_at(x, self._period)
         for _ in range(count):
             self._send(self.u)
@@ -159,7 +159,7 @@ class ControlStep:
                 x = robot.step(x, self.turning, force)
             except PCRError:
                 x = self._predicts[0](x, self.turning)
-        foresight.inputs["estimate"][:-2] = x
+        foresight.expected[:] = x
         self._gate.pass_by(count, x[4:])
 
     def coast(self) -> np.ndarray:
@@ -186,7 +186,7 @@ class ControlStep:
         k, x = checked_period("k", k), measured_vector("x", x, 4 + self.robot.n_rods)
         began = time.perf_counter()
         foresight = self.foresight
-        events = self._believe(k, x, foresight.inputs)
+        events = self._believe(k, x, foresight)
         if self.adaptation is not None:
             self.adaptation.correct(foresight, seen=self.believed[0])
         self._tell(k, foresight)
@@ -215,15 +215,14 @@ class ControlStep:
         here = self._look_on(outlook, plan, estimate, arriving, foreseen=plan is decided and not self.delay)
         if self.adaptation is not None:
             self.adaptation.predict(self._predicts[0], estimate, here, force)
-        known = foresight.inputs["estimate"]
-        known[:-2], known[-2:] = here, force
+        foresight.expected[:], foresight.force[:] = here, force
         if self.past is not None:
             self.past.remember(corrected, self._predicts[0])
         return Decision(u, plan, linearised - began, estimate, force, events)
 
-    def _believe(self, k: int, x: np.ndarray, given: dict[str, np.ndarray]) -> tuple[Event, ...]:
+    def _believe(self, k: int, x: np.ndarray, foresight: Foresight) -> tuple[Event, ...]:
         """Write what is believed of a measurement; what is not is as expected."""
-        expected, observer, past = given["estimate"][:-2], self.observer, self.past
+        expected, observer, past = foresight.expected, self.observer, self.past
         if past is not None:
             # As far from where it is expected as it was from where it was when the picture was taken.
             x = np.concatenate([x[:2] + (expected[:2] - past.tip(expected)), x[2:]])
@@ -240,14 +239,13 @@ class ControlStep:
                 past.clear()
         elif past is not None and found.p is not None:
             change = past.correct(observer.gain @ (np.array(found.p) - expected[:2]))
-            given["estimate"][:4] += change[:4]
-            given["estimate"][-2:] += change[4:]
+            expected[:4] += change[:4]
+            foresight.force[:] += change[4:]
             found.p = None  # it is done with
         if self.learner is not None:
             self.learner.see(k, found.p)
-        measured = given["measured"]
-        measured[:2] = expected[:2] if found.p is None else found.p
-        measured[2:] = expected[4:] if found.q is None else found.q
+        p = expected[:2] if found.p is None else found.p
+        foresight.inputs["measured"][:] = [*p, *(expected[4:] if found.q is None else found.q)]
         return found.events
 
     def _tell(self, k: int, foresight: Foresight) -> None:

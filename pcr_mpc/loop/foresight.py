@@ -89,6 +89,8 @@ class Foresight:
         Of the graph: what a caller writes before a call.
     rows : dict of str to ndarray
         Those of its inputs that have a column for each period or place: views with a row for each.
+    expected, force : ndarray
+        State (4 + n) at the next measurement, and force (2) on the tip, as they are estimated: parts of an input.
     window : ndarray, shape (N, 6 + 2n)
         The reference: states at the ends of the periods, rates in them, forces that the rods carry at their ends.
     corrected : ndarray, shape (6 + n,)
@@ -123,6 +125,7 @@ class Foresight:
         self.window = _rows(given["window"])
         self.rows |= {"states": self.window[:, : 4 + n], "inputs": self.window[:, 4 + n : -2]}
         given["end_force"] = self.window[-1, -2:]
+        self.expected, self.force = given["estimate"][:-2], given["estimate"][-2:]
         given["dt"][:], given["target_numbers"][:] = period, target.numbers
         given["pull"][:], given["prior"][:] = 1.0, (0.0, 1.0)  # from measured angles, with motors that follow at once
         # What the next period starts from: in it each place is where its neighbour is now.

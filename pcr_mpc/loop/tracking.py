@@ -215,7 +215,7 @@ class TrackingController(OnTheFly, Remade):
         if not self._started:
             return
         last = work.foresight
-        here = last.inputs["estimate"][:-2].copy()
+        here = last.expected.copy()
         needed = self._scene.n_periods + tuning.horizon + work.delay
         same_dynamics = (tuning.model.inertia, self._scene) == (old.model.inertia, scene)
         if self._live is not None:
@@ -245,7 +245,7 @@ class TrackingController(OnTheFly, Remade):
             work.foresight = self._make_foresight()
             work.foresight.reset(here, pose)
             work.foresight.target_from(last)
-            work.foresight.inputs["estimate"][:-2] = here
+            work.foresight.expected[:] = here
             if model_changed:
                 work.watch.reset(here, pose)
         write_constants(work.foresight, tuning, work.law, work.limits, work.observer)
