@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from pcr_mpc import UnstableError, all_equilibria, inverse_statics, solve_statics
+from pcr_mpc.compiled import has_compiler
+from pcr_mpc.plant.rods.method import Shooting, by_machine_code, shooting_method
+from pcr_mpc.plant.statics.first_rung import FirstRung
 
 from .test_statics_batch import FIGURES, loop, require_same
 
@@ -90,3 +93,20 @@ def test_motors_along_a_path_carry_what_is_wanted(pair, centre):
     cold = solve_statics(pair, eq.p, eq.q, method="multiple_shooting", steps=4)
     assert cold.force == pytest.approx(wanted, abs=1e-6)
     assert cold.mode == "LR"
+
+
+def test_shot_rods_are_the_same_by_machine_code_bit_for_bit(pair, centre):
+    """Both counts of iterations, and that it is machine code at all: the interpreter would agree with itself."""
+    coarse = {"method": "multiple_shooting", "segments": 2, "steps": 1}
+    guess = solve_statics(pair, centre.p, centre.q, **coarse)
+    p, q = centre.p + [1e-3, 2e-3], centre.q + [0.01, 0.0]
+    method = shooting_method(Shooting(2, 1), None)
+    for accuracy in (None, 1e-2):
+        found = [
+            FirstRung(pair, method, compiled=compiled).climb(guess.record, p, q, accuracy) for compiled in (False, True)
+        ]
+        assert found[0].iterations == found[1].iterations
+        np.testing.assert_array_equal(found[0].record, found[1].record)
+        np.testing.assert_array_equal(found[0].result, found[1].result)
+    if has_compiler():
+        assert by_machine_code(method).newton.class_name() == "GenericExternal"

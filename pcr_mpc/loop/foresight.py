@@ -125,7 +125,8 @@ class Foresight:
         self.window = _rows(given["window"])
         self.rows |= {"states": self.window[:, : 4 + n], "inputs": self.window[:, 4 + n : -2]}
         given["end_force"] = self.window[-1, -2:]
-        self.expected, self.force = given["estimate"][:-2], given["estimate"][-2:]
+        self.expected: np.ndarray = given["estimate"][:-2]
+        self.force: np.ndarray = given["estimate"][-2:]
         given["dt"][:], given["target_numbers"][:] = period, target.numbers
         given["pull"][:], given["prior"][:] = 1.0, (0.0, 1.0)  # from measured angles, with motors that follow at once
         # What the next period starts from: in it each place is where its neighbour is now.

@@ -40,7 +40,7 @@ def make_model(robot: Robot, model: Model) -> Plant:
     """Plant that is linearised."""
     return Plant(
         robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
-        inertia=model.inertia,
+        inertia=model.inertia, compiled=model.compiled,
     )  # fmt: skip
 
 
@@ -111,7 +111,8 @@ def make_foresight(tuning: Tuning, law: Law, robot: Robot, delay: int, period: f
     places = Places(delay, models, tuning.horizon)
     condense = law.condensing(robot.n_rods, models) if isinstance(law, LinearMPC) else None
     model = make_model(robot, tuning.model)
-    return Foresight(model, Plant(robot), places, period, condense, compiled=tuning.model.compiled)
+    target = Plant(robot, compiled=tuning.model.compiled)
+    return Foresight(model, target, places, period, condense, compiled=tuning.model.compiled)
 
 
 def graph_of(tuning: Tuning) -> tuple[object, ...]:

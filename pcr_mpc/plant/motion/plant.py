@@ -76,7 +76,8 @@ class Plant(Remade):
         that the tip position recorded may be off by that much).
     compiled : bool
         Whether `step` and `rollout` run as machine code: the same numbers, faster by half to three times, after a
-        second or so of compiling at the first step; needs a C compiler (`CompilerError` where there is none).
+        second or so of compiling at the first step; needs a C compiler (`CompilerError` where there is none). Rods
+        that are shot follow by machine code too, where there is a compiler.
 
     Notes
     -----
@@ -125,7 +126,7 @@ class Plant(Remade):
         self._advance = self._modal or INTEGRATORS[integrator](robot.n_rods)
         self._mass_moves = inertia in ("condensed", "full")
         self.shooting = checked_shooting(segments, steps, scheme)
-        self._solver = make_solver(rods, method, self.shooting, snapping=on_snap == "jump")
+        self._solver = make_solver(rods, method, self.shooting, snapping=on_snap == "jump", compiled=compiled)
         self._sag = CondensedWeight(robot) if weight == "condensed" else None
         self._at: list[float] | None = None
         self._accuracy = 0.0  # of the derivatives there

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ...buffered import graph_cache
+from ...compiled import fastest
 from . import elastica, inertia, multiple_shooting, shooting_inertia
 from .chart import HeldShape
 from .equations import Layout, RodPhysics, aligned_steps, sample_rod
@@ -238,6 +239,12 @@ def warm_calls(kind: Kind, method: RodMethod, iterations: int) -> Any:
     record = ca.vertcat(*(ca.vec(ca.horzcat(*found)) for found in columns.values()))
     result = ca.vertcat(force, ca.vec(k), ca.vec(ca.horzcat(*g)))
     return ca.Function("warm_step", [target, start_record, vector], [record, verdict, result])
+
+
+@graph_cache(maxsize=16)
+def by_machine_code(method: RodMethod) -> RodMethod:
+    """Return the same method with what a rod costs as machine code: one function, whoever calls it how often."""
+    return replace(method, newton=fastest(method.newton), residual=fastest(method.residual))
 
 
 def enough_nodes(loads: np.ndarray, least: int) -> int:

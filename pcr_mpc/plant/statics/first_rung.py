@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ...buffered import BufferedFunction
+from ...compiled import has_compiler
 from ..robot import Robot
 from ..rods.follower import BRANCH_CHANGE
-from ..rods.method import RodMethod, warm_step
+from ..rods.method import RodMethod, by_machine_code, warm_step
 from ..rods.numbers import Kind
 from .equilibrium import Equilibrium
 from .state import record_size
@@ -36,10 +37,12 @@ class FirstRung:
     ----------
     robot : Robot
     method : RodMethod
+    compiled : bool
+        Whether each rod is machine code where there is a compiler.
     """
 
-    def __init__(self, robot: Robot, method: RodMethod) -> None:
-        self.robot, self.method = robot, method
+    def __init__(self, robot: Robot, method: RodMethod, *, compiled: bool = False) -> None:
+        self.robot, self.method, self._compiled = robot, method, compiled
         self._kind = Kind(robot.n_rods, method.layout)
         self._graphs = {iterations: self._graph(iterations) for iterations in (1, 2)}
         self._start_size = len(self._graphs[1][-1])
@@ -47,7 +50,8 @@ class FirstRung:
 
     def _graph(self, iterations: int) -> tuple[BufferedFunction, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Graph, and of its inputs the pose, the tip and the angles in it, and the start."""
-        graph = BufferedFunction(warm_step(self._kind, self.method, iterations))
+        method = by_machine_code(self.method) if self._compiled and has_compiler() else self.method
+        graph = BufferedFunction(warm_step(self._kind, method, iterations))
         pose, start, numbers = graph.inputs
         numbers[:] = self._kind.pack(self.robot)
         return graph, pose, pose[:2], pose[2:], start

@@ -205,12 +205,14 @@ def solver_of(robot: Robot, method: str, shooting: Shooting) -> RodSolver | Sing
     return make_solver(robot, method, shooting)
 
 
-def make_solver(robot: Robot, method: str, shooting: Shooting, *, snapping: bool = False) -> RodSolver | SingleShooting:
-    """Build the solver that goes by the name ``method``."""
+def make_solver(
+    robot: Robot, method: str, shooting: Shooting, *, snapping: bool = False, compiled: bool = False
+) -> RodSolver | SingleShooting:
+    """Build the solver that goes by the name ``method``; ``compiled``: rods that are shot follow by machine code."""
     if method == "closed_form":
         return RodSolver(robot, closed_form_method(), snapping=snapping)
     if method == "multiple_shooting":
-        return RodSolver(robot, shooting_method(shooting, robot_layout(robot)), snapping=snapping)
+        return RodSolver(robot, shooting_method(shooting, robot_layout(robot)), snapping=snapping, compiled=compiled)
     if method == "single_shooting":
         if snapping:
             raise ValueError("single shooting does not notice where a branch ends: on_snap='jump' needs another method")

@@ -53,6 +53,8 @@ class RodSolver:
     snapping : bool
         What `move` does where a rod's branch ends: raise, or let the rod fall to the stable shape that the
         descent of its energy reaches, recorded in ``snaps``.
+    compiled : bool
+        Whether the first rung runs as machine code where there is a compiler.
 
     Attributes
     ----------
@@ -70,7 +72,7 @@ class RodSolver:
     branch: that is for `start`. A failed call leaves the last pose as it was.
     """
 
-    def __init__(self, robot: Robot, method: RodMethod, *, snapping: bool = False) -> None:
+    def __init__(self, robot: Robot, method: RodMethod, *, snapping: bool = False, compiled: bool = False) -> None:
         if method.layout is None:
             require_plain(robot, f"method {method.name!r}")
         elif snapping:
@@ -84,7 +86,7 @@ class RodSolver:
         # Plain rods share one follower.
         physics = (None,) if method.layout is None else in_layout(robot, method.layout)
         self._followers = [RodFollower(method, of_rod) for of_rod in physics] * (robot.n_rods // len(physics))
-        self.first = FirstRung(robot, method)
+        self.first = FirstRung(robot, method, compiled=compiled)
         self._state: RobotState | None = None
         self._spare: RobotState | None = None
         self._moment_units = moment_units(robot)
