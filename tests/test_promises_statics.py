@@ -21,7 +21,8 @@ from pcr_mpc import (
     inverse_statics,
     solve_statics,
 )
-from pcr_mpc.plant.statics.free_tip import free_solver, settle
+from pcr_mpc.plant.statics.balance import settle
+from pcr_mpc.plant.statics.free_tip import free_solver
 from pcr_mpc.plant.statics.stability import count_conjugate_points, distance_to_fold
 
 

@@ -21,7 +21,7 @@ from pcr_mpc.linearisation.linear_model import column_size, n_states
 from pcr_mpc.plant.motion import distributed
 from pcr_mpc.plant.mujoco import hinge_chain
 from pcr_mpc.plant.rods import snap
-from pcr_mpc.plant.statics import free_tip, solver
+from pcr_mpc.plant.statics import balance, free_tip, solver
 from pcr_mpc.plant.statics.single_shooting import SingleShooting
 from pcr_mpc.study import choice
 
@@ -103,13 +103,13 @@ def test_no_record_is_kept_by_single_shooting(pair):
 
 def test_iterations_that_run_out_are_counted(pair, centre, monkeypatch):
     """Each search with too few: the error carries how many, how far, and where it was."""
-    monkeypatch.setattr(free_tip, "_MAX_ITERATIONS", 1)
+    monkeypatch.setattr(balance, "_MAX_ITERATIONS", 1)
     with pytest.raises(ConvergenceError, match=r"no stable pose found.*did not settle in 1 iterations, last at p = "):
         forward_statics(pair, centre.q + [0.4, -0.6])
     rods = free_tip._solver(pair)
     rods.start(centre.p + [0.05, 0.0], centre.q)
     with pytest.raises(ConvergenceError, match=r"settle in 1 iterations.*pass a guess") as caught:
-        free_tip.settle(rods, centre.p + [0.05, 0.0], centre.q, np.zeros(2))
+        balance.settle(rods, centre.p + [0.05, 0.0], centre.q, np.zeros(2))
     assert (caught.value.iterations, caught.value.last.shape) == (1, (2,))
     assert 0.0 < np.linalg.norm(caught.value.last - centre.p) < 0.05  # it came nearer
     assert caught.value.residual > 0.0

@@ -18,8 +18,9 @@ from ..rods.equations import aligned_steps, sample_rod
 from ..rods.method import closed_form_method
 from ..rods.multiple_shooting import rod_newton
 from ..rods.physics import require_plain
+from .balance import settle
 from .equilibrium import Equilibrium
-from .free_tip import free_solver, settle
+from .free_tip import free_solver
 from .solver import RodSolver
 
 _MAX_ITERATIONS = 40
