@@ -3,9 +3,9 @@ import csv
 import numpy as np
 import pytest
 
-from experiments.linear_validity import (
+from experiments.linear_validity import main
+from experiments.linear_validity_radius import (
     ALLOWED,
-    main,
     motor_directions,
     predicted_radius,
     radius_along,

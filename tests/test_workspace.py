@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from experiments import workspace
-from experiments.workspace import Sheet, areas, explore, stop_distance, turn_between
+from experiments.workspace import areas, stop_distance
+from experiments.workspace_sheet import Sheet, explore, turn_between
 from pcr_mpc import Equilibrium, PCRError, Robot, forward_statics, inverse_statics, solve_statics
 
 
