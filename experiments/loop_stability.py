@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from pcr_mpc import PCRError, Scene, Tuning, load_scene, load_tuning
+from pcr_mpc import MarginsError, PCRError, Scene, Tuning, load_scene, load_tuning
 from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import RED, plt, save_figure
@@ -114,7 +114,10 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     row: dict[str, Any] = {"controller": cell.controller, "map": cell.map, "x": cell.x, "y": cell.y}
     try:
         believed = believed_scene(cell)
-        row["predicted_radius"] = predicted(cell)
+        try:
+            row["predicted_radius"] = predicted(cell)
+        except MarginsError:  # measured it can be
+            row["predicted_radius"] = math.nan
         found = push(believed, true_scene(cell, believed))
     except (PCRError, ValueError) as error:
         return {**row, "rms_mm": math.nan, "stable": 0, "failure": f"{type(error).__name__}: {error}"}
@@ -141,7 +144,7 @@ def boundaries(rows: Sequence[dict[str, Any]], study: Map) -> list[tuple[int, in
     by_place = {(row["x"], row["y"]): row for row in rows}
     for y in study.y:
         line = [by_place[x, y] for x in study.x if (x, y) in by_place]
-        if len(line) < len(study.x):
+        if len(line) < len(study.x) or any(math.isnan(row["predicted_radius"]) for row in line):
             continue
         measured = next((i for i, row in enumerate(line) if not row["stable"]), len(line))
         said = next((i for i, row in enumerate(line) if not row["predicted_radius"] < 1.0), len(line))

@@ -13,7 +13,7 @@ SCENE = str(MODELS / "scenes" / "lemniscate.toml")
 
 
 def test_predicted_margins_as_json(tmp_path, capsys):
-    arguments = ["margins", SCENE, "--controller", "frozen", "--poses", "2", "--predicted", "--json"]
+    arguments = ["margins", SCENE, "--controller", "frozen", "--poses", "1", "--predicted", "--json"]
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["controller"] == "frozen"

@@ -37,6 +37,7 @@ def test_finished_cells_are_read_back_and_drawn(tmp_path):
     assert (tmp_path / "map.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_cell_is_predicted_as_its_margin_says():
     """The lemniscate's tuning bears 22 ms; a stiffer robot bears less, and so do longer periods."""
     late = [predicted(Cell("lemniscate", "delay_stiffness", ms, 1.0)) for ms in (20.0, 24.0)]

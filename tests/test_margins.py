@@ -7,6 +7,7 @@ import pytest
 
 from pcr_mpc import load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.errors import MarginsError
+from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.trajectory import Hold
 from pcr_mpc.study.margins.linear_loop import LinearLoop
@@ -60,7 +61,7 @@ def linear_response(loop: LinearLoop, size: float, count: int) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize("name", ["default", "lqr", "pd"])
+@pytest.mark.parametrize("name", ["default", pytest.param("lqr", marks=pytest.mark.slow), "pd"])
 def test_the_linear_loop_is_the_loop_that_runs(holding, name):
     """After a push tip and rates move as the linear loop says, and what is left falls with the square of the push."""
     tuning = tuning_of(name)
@@ -75,6 +76,7 @@ def test_the_linear_loop_is_the_loop_that_runs(holding, name):
     assert (misses[1] < 0.65 * misses[0] + 1e-3).all()
 
 
+@pytest.mark.slow
 def test_without_an_observer_too(holding):
     tuning = replace(tuning_of("default"), observer=None)
     loop = LinearLoops(holding, tuning, poses=1).all()[0]
@@ -110,7 +112,7 @@ def test_another_robot_is_the_robot_that_moves(holding):
 
 def test_at_a_margin_the_loop_neither_grows_nor_decays(holding):
     """An eigenvalue has size 1 at the delay margin, and at the gain and the phase that python-control finds."""
-    loop = LinearLoops(replace(holding, untold_delay=0.0, motors=None), tuning_of("default"), poses=1).all()[0]
+    loop = LinearLoops(replace(holding, untold_delay=0.0, motors=None), tuning_of("lemniscate"), poses=1).all()[0]
     assert loop.later(delay_margin(loop)).spectral_radius() == pytest.approx(1.0, abs=3e-4)
     frequencies = np.geomspace(1e-3, 0.999, 400) * 0.5 / loop.period
     for motor, (gain, phase) in enumerate(_classical(loop, frequencies)):
@@ -124,14 +126,15 @@ def test_at_a_margin_the_loop_neither_grows_nor_decays(holding):
 
 def test_a_delay_that_is_told_is_borne(lemniscate):
     """Known, a period more costs a few milliseconds of margin; untold, all of the period."""
-    tuning = tuning_of("default")
-    margins = [predict_delay_margin(replace(lemniscate, **more), tuning, poses=2).value
+    tuning = tuning_of("lemniscate")
+    margins = [predict_delay_margin(replace(lemniscate, duration=0.5, **more), tuning, poses=1).value
                for more in ({}, {"delay": 1}, {"untold_delay": 0.005})]  # fmt: skip
     assert margins[0] > 0.01
     assert margins[1] > margins[0] - 0.005
     assert margins[2] == pytest.approx(margins[0] - 0.005, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_three_motors_have_margins():
     scene = load_scene(MODELS / "scenes" / "three_rods.toml")
     assert 0.0 < predict_delay_margin(scene, poses=2).value < 0.3
@@ -142,10 +145,17 @@ def test_what_has_no_margins_is_refused(lemniscate):
         predict_delay_margin(lemniscate, load_tuning(CONTROLLERS / "nonlinear.toml"))
     with pytest.raises(MarginsError, match="measures nothing"):
         predict_delay_margin(lemniscate, load_tuning(CONTROLLERS / "open_loop.toml"))
+    late = replace(lemniscate, camera=Camera(latency=0.02, every=2))
+    with pytest.raises(MarginsError, match="20 ms late, sees every 2"):
+        predict_delay_margin(late)
+    observer = replace(lemniscate.tuning.observer, adapts=("tip_mass",))
+    with pytest.raises(MarginsError, match="adapts tip_mass"):
+        predict_delay_margin(lemniscate, replace(lemniscate.tuning, observer=observer))
     with pytest.raises(MarginsError, match="no reference"):
         predict_delay_margin(load_scene(MODELS / "scenes" / "release.toml"))
 
 
+@pytest.mark.slow
 def test_a_push_dies_away_below_the_margin_and_grows_above(lemniscate):
     tuning = load_tuning(CONTROLLERS / "frozen.toml")
     margin = predict_delay_margin(lemniscate, tuning, poses=4)

@@ -12,6 +12,7 @@ from ...errors import MarginsError, PCRError
 from ...linearisation.linear_model import LinearModel
 from ...linearisation.linearise import linearise
 from ...loop.feed_forward import InverseDynamics, feed_forward
+from ...loop.hardware.camera import IDEAL as IDEAL_CAMERA
 from ...loop.parts import make_law, make_model, make_observer, motor_limits, pull
 from ...loop.scene import Scene
 from ...plant.motion.plant import DERIVATIVE_ACCURACY, Plant
@@ -71,7 +72,7 @@ class LinearLoops:
     ------
     MarginsError
         There is nothing to analyse: no reference, or a law that is not linear or has no feedback; or the reference
-        passes poses without a linear model.
+        passes poses without a linear model; or camera or observer are none that the linear loop knows.
     """
 
     def __init__(
@@ -89,6 +90,11 @@ class LinearLoops:
             raise MarginsError(
                 f"tuning {tuning.name}, law {tuning.law}: it {why[tuning.law]}; laws with margins are "
                 f"{', '.join(LINEAR_LAWS)}"
+            )
+        if why_not := _not_linear(scene, tuning):
+            raise MarginsError(
+                f"scene {scene.name} with tuning {tuning.name}: {why_not}, which the linear loop does not know; "
+                "measure_delay_margin measures how much further delay it bears"
             )
         self.scene = scene = scene.tuned(tuning)
         self.tuning = tuning
@@ -152,6 +158,19 @@ class LinearLoops:
     def all(self) -> list[LinearLoop]:
         """The loops about all poses."""
         return [self.at(pose) for pose in self.poses]
+
+
+def _not_linear(scene: Scene, tuning: Tuning) -> str:
+    """What of a loop has no place in a linear one that is the same in every period; empty if there is nothing."""
+    camera, observer = scene.camera, tuning.observer
+    if camera is not None and camera != IDEAL_CAMERA:
+        return (f"the camera is {1e3 * camera.latency:g} ms late, sees every {camera.every}. period and loses "
+                f"{100 * camera.lost:g} % of its pictures")  # fmt: skip
+    if observer is not None and observer.latency:
+        return f"its observer takes tips to be {1e3 * observer.latency:g} ms old"
+    if observer is not None and observer.adapts:
+        return f"its observer adapts {', '.join(observer.adapts)}"
+    return ""
 
 
 def scaled(robot: Robot, *, stiffness: float = 1.0, mass: float = 1.0) -> Robot:
