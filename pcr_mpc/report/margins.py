@@ -46,8 +46,10 @@ def margins_table(summary: dict[str, Any]) -> str:
     ]
     tail = [f"Predicted at {summary['poses']} poses of the reference, where it is least; measured in the nonlinear "
             "simulation, held there."]  # fmt: skip
+    text = f"Following the reference it bears {_number(along['predicted_along_path'])} ms of further delay, predicted"
     if "measured_along_path" in along:
-        tail.append(f"Following the reference it bears {_number(along['measured_along_path'])} ms of further delay.")
+        text += f"; {_number(along['measured_along_path'])} ms, measured"
+    tail.append(f"{text}.")
     if not (margins["spectral_radius"]["predicted"] or 0.0) < 1.0:
         tail.append("NOT STABLE AS IT IS: take a slower tuning, or tell the controller of its delays.")
     header = ("margin", "predicted", "measured", "at [s]", "tip [mm]")

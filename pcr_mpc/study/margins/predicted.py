@@ -66,6 +66,8 @@ class Margins(Frozen):
         Spectral radius of a period.
     delay : ndarray, shape (M,)
         Further delay that the loop bears [s].
+    path_delay : float
+        The same on the way along all poses, where it may be unstable for a moment [s].
     gain, phase : ndarray, shape (M, n)
         Gain margin [-] and phase margin [deg] at each motor, the others closed, by python-control.
     stiffness, mass : ndarray, shape (M,)
@@ -89,6 +91,7 @@ class Margins(Frozen):
     p: np.ndarray
     radius: np.ndarray
     delay: np.ndarray
+    path_delay: float
     gain: np.ndarray
     phase: np.ndarray
     stiffness: np.ndarray
@@ -119,16 +122,19 @@ class Margins(Frozen):
         }
 
 
-def delay_margin(loop: LinearLoop) -> float:
-    """Further delay up to which a linear loop is stable [s]; NaN: it is not stable as it is."""
-    steps = np.arange(LONGEST * _PER_PERIOD + 1) * loop.period / _PER_PERIOD
-    return first_loss(lambda time: loop.later(time).spectral_radius() < 1.0, steps.tolist(),
-                      _DELAY_TOLERANCE * loop.period)  # fmt: skip
+def delay_margin(*loops: LinearLoop) -> float:
+    """Further delay up to which a linear loop is stable, or a way along several [s]; NaN: it is not as it is."""
+    period = loops[0].period
+    steps = np.arange(LONGEST * _PER_PERIOD + 1) * period / _PER_PERIOD
+    return first_loss(lambda time: path_radius([loop.later(time) for loop in loops]) < 1.0, steps.tolist(),
+                      _DELAY_TOLERANCE * period)  # fmt: skip
 
 
 def path_radius(loops: Sequence[LinearLoop]) -> float:
     """Factor by which a small deviation grows in a period on the way along all poses, on the mean, if the way is gone
     again and again: on a path a loop may be unstable for a moment, and recover."""
+    if len(loops) == 1:
+        return loops[0].spectral_radius()
     product = np.eye(len(loops[0].closed().A))
     for loop in loops:
         product = np.linalg.matrix_power(loop.closed().A, _STAY) @ product
@@ -205,6 +211,7 @@ def predict_margins(scene: Scene, tuning: Tuning | None = None, *, poses: int = 
         p=np.stack([loop.p for loop in linear]),
         radius=np.array([float(np.abs(each).max()) for each in spectra]),
         delay=np.array([delay_margin(loop) for loop in linear]),
+        path_delay=delay_margin(*linear),
         gain=np.array([[gain for gain, _ in each] for each in classical]),
         phase=np.array([[phase for _, phase in each] for each in classical]),
         stiffness=np.array([_factor(loops, pose, "stiffness") for pose in loops.poses]),

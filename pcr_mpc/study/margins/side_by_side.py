@@ -38,9 +38,9 @@ def compare_margins(
         Ready for JSON: ``scene``, ``controller``, ``period_ms``, ``poses``, and under ``margins`` for each of
         ``delay_margin_ms``, ``stiffness_factor``, ``mass_factor``, ``motor_lag_ms`` what is ``predicted`` for the pose
         where it is least (``t_s``, ``p_m``) and ``measured`` for a tip that is held there; the delay margin also
-        ``measured_along_path``. ``spectral_radius``, ``sensitivity_peak`` and, for each motor, ``gain_margin`` and
-        ``phase_margin_deg`` are predicted only. None: no limit was found; a margin of 0, or a factor of 1: the loop is
-        not stable as it is.
+        ``predicted_along_path`` and ``measured_along_path``, where a loop may be unstable for a moment.
+        ``spectral_radius``, ``sensitivity_peak`` and, for each motor, ``gain_margin`` and ``phase_margin_deg`` are
+        predicted only. None: no limit was found; a margin of 0, or a factor of 1: the loop is not stable as it is.
 
     Raises
     ------
@@ -57,6 +57,8 @@ def compare_margins(
     }  # fmt: skip
     for name in ("gain_margin", "phase_margin_deg"):
         rows[name] = [{"predicted": said["value"], "t_s": said["t_s"], "p_m": said["p_m"]} for said in found[name]]
+    along_path = 0.0 if math.isnan(predicted.path_delay) else 1e3 * predicted.path_delay
+    rows["delay_margin_ms"]["predicted_along_path"] = along_path if math.isfinite(along_path) else None
     if measure:
         least = predicted.least(predicted.delay)
         held = measure_delay_margin(told, p=least.p, guess=least.value, progress=progress)
