@@ -15,6 +15,7 @@ from pcr_mpc.codegen.folder import write_folder
 from pcr_mpc.codegen.library import GeneratedController, build
 from pcr_mpc.codegen.scope import check_scope
 from pcr_mpc.codegen.subject import Subject
+from pcr_mpc.codegen.tables import parameters
 from pcr_mpc.errors import GenerationError, PCRError
 from pcr_mpc.loop.make_controller import make_controller
 from pcr_mpc.loop.scene_file import load_scene
@@ -130,6 +131,33 @@ def test_the_worst_leads_to_the_same_rungs(tmp_path):
                 x = plant.step(x, found.u, push)
     assert doubts > 40
     assert rungs >= {None, "shifted_plan", "lqr"}
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_parameters_that_change_while_it_runs_do_what_retune_does(lemniscate, tmp_path):
+    scene = load_scene(SCENES / "lemniscate.toml")
+    subject = Subject.of_scene(scene)
+    other = replace(scene.tuning, position_weight=3e4, input_weight=0.02)
+    in_c = GeneratedController(build(copied(lemniscate, tmp_path), f"CC={CC}", *QUICK), subject)
+    in_python, as_before = make_controller(scene), make_controller(scene)
+    for controller in (in_c, in_python, as_before):
+        controller.start(subject.pose)
+    plant, x, changed = scene.make_plant(), np.concatenate([subject.pose.p, [0.0, 0.0], subject.pose.q]), 0.0
+    plant.reset(x, subject.pose)
+    for k in range(80):
+        if k == 40:
+            in_python.retune(other)
+            in_c.set_parameters(parameters(Subject.of_scene(scene, other)))
+        expected, found = in_python.step(k, x), in_c.step(k, x)
+        assert found.u == pytest.approx(expected.u, abs=1e-9), k
+        assert found.plan.iterations == expected.plan.iterations, k
+        changed = max(changed, float(np.abs(as_before.step(k, x).u - found.u).max()))
+        for _ in range(10):
+            x = plant.step(x, found.u)
+    assert changed > 1e-5
+    with pytest.raises(PCRError, match="refuses"):
+        in_c.set_parameters(parameters(subject) | {"rate": np.nan})
 
 
 @needs_compiler
