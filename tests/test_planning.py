@@ -13,6 +13,7 @@ from pcr_mpc import (
     Line,
     ModelError,
     PlanLimits,
+    Spline,
     UnreachableError,
     UnstableError,
     inverse_statics,
@@ -27,6 +28,7 @@ from pcr_mpc.linearisation.pose_limits import PoseLimits
 from pcr_mpc.loop.trajectory import PickAndPlace, smooth_step
 from pcr_mpc.study.planning.course import paced
 from pcr_mpc.study.planning.fastest import Problem, evaluated
+from pcr_mpc.study.planning.free import way_points
 from pcr_mpc.study.planning.meshing import points
 from pcr_mpc.study.planning.motion import Carrier
 from pcr_mpc.study.planning.pace import constant_pace, spline_of
@@ -228,6 +230,12 @@ def test_slopes_are_those_of_differences(scene, pair):
         allowed = {"change of rate": 5e-2, "motor rate": 5e-3}.get(here.limit, 1e-3)
         assert np.abs(predicted - found).max() < allowed * np.abs(found).max(), here.limit
     assert {use.limit for use in start.uses} >= {"stiffness", "rod margin", "tip jerk", "motor torque"}
+
+
+def test_a_closed_path_is_not_free():
+    closed = Spline(((0.0, 0.25), (0.03, 0.26), (0.0, 0.28)), 0.1, closed=True)
+    with pytest.raises(ModelError, match="is closed, and only between the way-points of an open one"):
+        way_points(closed)
 
 
 @pytest.mark.slow

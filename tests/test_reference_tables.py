@@ -139,6 +139,24 @@ def test_tip_and_duration_may_be_left_to_the_reference(tmp_path):
         load_scene(path)
 
 
+def test_a_start_at_the_first_row_is_where_the_smoothed_path_begins(tmp_path):
+    text = (
+        (SCENES / "hand_drawn.toml").read_text().replace("../../", f"{MODELS.parent}/").replace('"../', f'"{MODELS}/')
+    )
+    text = re.sub(r'file = "', f'file = "{SCENES}/', text)
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    begin = np.array(load_scene(path).start_tip)
+    for off, refused in ((2e-5, False), (1e-3, True)):
+        row = (begin + (off, 0.0)).tolist()
+        path.write_text(text.replace('mode = "LR"', f'tip = {row}\nmode = "LR"'))
+        if refused:
+            with pytest.raises(ModelError, match="is not where the reference begins"):
+                load_scene(path)
+        else:
+            assert load_scene(path).start_tip == tuple(begin.tolist())
+
+
 def test_the_page_s_tables_are_read_and_its_python_runs(monkeypatch, capsys):
     page = (MODELS.parent / "docs" / "paths.md").read_text(encoding="utf-8")
     tables = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)

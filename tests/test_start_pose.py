@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import AmbiguousPoseError, MeasurementError, PCRError, Sensors, inverse_statics, load_robot
+from pcr_mpc import AmbiguousPoseError, MeasurementError, PCRError, Sensors, inverse_statics, load_robot, solve_statics
 from pcr_mpc.loop.start_pose import find_start
 
 from .conftest import MODELS
@@ -65,6 +65,24 @@ def test_whole_turns_do_not_matter_to_encoders_that_wrap(pair, centre):
 def test_what_fits_no_pose_is_said_with_numbers(pair, centre, change, message):
     with pytest.raises(MeasurementError, match=message):
         find_start(pair, *change(centre.p, centre.q))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p, q: (1e3 * p, q), "is the tip in millimetres"),
+        (lambda p, q: (p, np.degrees(q)), "are the angles degrees"),
+        (lambda p, q: (p, q + (2 * np.pi, 0.0)), "whole turns off"),
+    ],
+)
+def test_what_cannot_be_is_explained_though_the_tip_is_pushed(pair, centre, change, message):
+    """A rough pose, such as a hand would write: it takes half of the largest load to stay there."""
+    p, q = centre.p, centre.q + (0.12, 0.12)
+    eq = solve_statics(pair, p, q, guess=centre)
+    assert 0.3 < np.linalg.norm(eq.force) / max(9.81 * pair.tip_mass, pair.force_scale) < 1.0
+    find_start(pair, p, q)
+    with pytest.raises(MeasurementError, match=message):
+        find_start(pair, *change(p, q))
 
 
 def test_two_poses_that_fit_are_said_and_a_mode_settles_it():

@@ -163,12 +163,13 @@ def about_rods(robot: Robot, scene: Scene | None, figures: dict[str, Any]) -> li
         sag = robot.tip_mass * _GRAVITY / (3 * float((robot.stiffnesses / robot.lengths**3).sum()))
         shortest = float(robot.lengths.min())
         if sag > _HANGS * shortest:
-            far = f"about {1e3 * sag:.2g} mm" if sag < shortest else "their own length or more"
+            far = f"about {1e3 * sag:.0f} mm" if sag < shortest else "their own length or more"
             remarks.append(
                 _note(
                     "support",
-                    f"the robot lies flat, and round rods alone would let the tip sag out of the plane by {far}: let "
-                    "it slide on a plate, or hang it on a long string",
+                    f"the robot lies flat, and if its rods are round, they let the tip sag out of the plane by {far}: "
+                    "let it slide on a plate, or hang it on a long string. Upright strips are as many times stiffer "
+                    "that way as the square of width over thickness",
                 )
             )
     return remarks

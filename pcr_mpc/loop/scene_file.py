@@ -10,7 +10,7 @@ import numpy as np
 
 from ..control.tuning import load_tuning
 from ..errors import ModelError
-from ..plant.robot import load_robot
+from ..plant.robot import Robot, load_robot
 from ..toml_table import Table, read_toml
 from .hardware.camera import read_camera
 from .hardware.motors import read_motors
@@ -23,6 +23,7 @@ from .trajectory import Trajectory
 
 # Distance of the start that is given from the reference that is taken for the same place, in rod lengths.
 _START_ROUNDING = 2.5e-9
+_START_SMOOTHING = 1e-4  # by which a path of a file may begin beside its first row
 _TENS = 10  # control periods, of which a duration that follows from the reference is a multiple
 
 
@@ -60,8 +61,11 @@ def load_scene(path: str | Path) -> Scene:
             velocity = start.vector("velocity", 2, (0.0, 0.0))
             if tip is None and motors is None and mode is not None and trajectory is not None:
                 tip = tuple(trajectory(np.zeros(1))[0, 0].tolist())
+            elif tip is not None and trajectory is not None:
+                tip = _where_it_begins(start, tip, trajectory, robot)
             if (tip is None) == (motors is None) or (tip is None) != (mode is None):
-                raise start.fail("tip", "give either tip and mode, or motors")
+                alone = '; mode = "LR" alone (a letter a rod) where the reference begins' if trajectory else ""
+                raise start.fail("tip", f"give either tip and mode, or motors{alone}")
         with file.table("plant") as table:
             plant = read_plant(table, robot)
         with file.table("control") as control:
@@ -91,15 +95,6 @@ def load_scene(path: str | Path) -> Scene:
             file=str(path),
             key="control.tuning",
         )
-    if tip is not None and trajectory is not None:
-        begin = trajectory(np.zeros(1))[0, 0]
-        if np.hypot(*(begin - tip)) > _START_ROUNDING * robot.lengths.mean():
-            raise ModelError(
-                f"{path}: start.tip {tip} is not where the reference begins, {tuple(begin.tolist())}; without "
-                "start.tip it starts there",
-                file=str(path),
-                key="start.tip",
-            )
     try:
         require_within_stops(scene)
         require_reach(scene)
@@ -108,6 +103,16 @@ def load_scene(path: str | Path) -> Scene:
     except ModelError as error:
         raise ModelError(f"{path}: {error}", file=str(path), **error.details) from None
     return scene if scene.tuning is None else scene.tuned(scene.tuning)
+
+
+def _where_it_begins(start: Table, tip: tuple[float, ...], trajectory: Trajectory, robot: Robot) -> tuple[float, ...]:
+    """Return the tip at the start; that of the reference if what is given is it but for rounding and smoothing."""
+    begin = trajectory(np.zeros(1))[0, 0]
+    apart = math.hypot(*(begin - tip)) / robot.lengths.mean()
+    if apart > _START_SMOOTHING:
+        said = "(" + ", ".join(f"{x:.6g}" for x in begin) + ")"
+        raise start.fail("tip", f"{tip} is not where the reference begins, {said}; without start.tip it starts there")
+    return tip if apart <= _START_ROUNDING else tuple(begin.tolist())
 
 
 def _duration(file: Table, trajectory: Trajectory | None, period: float) -> float:

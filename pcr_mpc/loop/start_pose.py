@@ -188,11 +188,15 @@ def _misfit(
     """Why nothing fits, and what would."""
     said = f"the robot {robot.name} has no pose at p = {p} m, q = {q} rad"
     far = min(robot.slacks(p)) < -_MILLIMETRES
+    lower, upper = robot.angle_limits.T
+    # What cannot be as it stands is explained by whatever can be; what could, by what fits well.
+    impossible = far or bool((q < lower - _BEYOND).any() or (q > upper + _BEYOND).any())
+    possible = load if impossible else _SURELY * load
     for of_tip, change, advice in _EXPLANATIONS:
         # Between the motors is always somewhere: what is in reach is no millimetres.
-        if of_tip <= far and _fitting(robot, *change(robot, p, q), sensors, mode, _SURELY * load):
+        if of_tip <= far and _fitting(robot, *change(robot, p, q), sensors, mode, possible):
             return MeasurementError(f"{said}: {advice}", p=p, q=q)
-    reasons, lower, upper = [], *robot.angle_limits.T
+    reasons = []
     for i, slack in enumerate(robot.slacks(p)):
         if slack < 0:
             length = robot.rods[i].length

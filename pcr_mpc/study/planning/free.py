@@ -122,10 +122,16 @@ def way_points(trajectory: Trajectory) -> np.ndarray:
     if isinstance(trajectory, PickAndPlace):
         return np.array([trajectory.pick, trajectory.place])
     points = getattr(trajectory, "points", None)
-    if points is None or getattr(trajectory, "closed", False) or len(points) > 100:
+    if points is not None and getattr(trajectory, "closed", False):
+        raise ModelError(
+            f"the path of this {type(trajectory).__name__} is closed, and only between the way-points of an open one "
+            "can a plan choose its own; give closed = false, or plan its timing alone",
+            key="reference",
+        )
+    if points is None or len(points) > 100:
         raise ModelError(
             f"a {type(trajectory).__name__} has no way-points between which its path could be free; give a spline or "
-            "waypoints, open ones, or plan its timing alone",
+            "waypoints, at most 100, or plan its timing alone",
             key="reference",
         )
     return np.array(points)
