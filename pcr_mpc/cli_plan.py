@@ -8,6 +8,7 @@ import math
 import time
 from pathlib import Path
 
+from .design.examination import moving_mass
 from .errors import OutputError
 from .files import require_free, saved, stamped, write_text
 from .loop.scene_file import load_scene
@@ -38,7 +39,8 @@ def plan(options: argparse.Namespace) -> int:
         free=options.free,
         progress=True,
     )
-    summary = planned.summary() | {"planning_s": time.perf_counter() - begin}
+    share = moving_mass(scene.start())[1]
+    summary = planned.summary() | {"share_of_rods": share, "planning_s": time.perf_counter() - begin}
 
     def write(folder: Path) -> None:
         write_text(folder / out.name, stamped(planned.csv()))

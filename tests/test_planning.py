@@ -26,6 +26,7 @@ from pcr_mpc import (
 from pcr_mpc.cli import main
 from pcr_mpc.linearisation.pose_limits import PoseLimits
 from pcr_mpc.loop.trajectory import PickAndPlace, smooth_step
+from pcr_mpc.report.planning import plan_table
 from pcr_mpc.study.planning.course import paced
 from pcr_mpc.study.planning.fastest import Problem, evaluated
 from pcr_mpc.study.planning.free import way_points
@@ -331,6 +332,9 @@ def test_the_command_writes_a_path_and_a_picture(tmp_path, capsys):
     assert found["duration_s"] == pytest.approx(load_path(out).duration)
     assert found["largest_excess"] <= 1e-3
     assert found["top_speed_m_s"] == pytest.approx(0.5, rel=2e-3)
+    # Two rods of 5.6 g beside 250 g: less than all of them, for they are clamped at one end.
+    assert 0.005 < found["share_of_rods"] < 11.1 / 261.1
+    assert "38 % of the mass that moves, left out" in plan_table(found | {"share_of_rods": 0.38})
     assert {row["limit"] for row in found["limits"]} >= {"motor rate", "change of rate", "tip speed"}
     assert (tmp_path / "fast.png").stat().st_size > 10_000
     out.write_text("mine")

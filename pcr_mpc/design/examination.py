@@ -80,7 +80,7 @@ def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
     except PCRError as error:
         found.remarks += [Remark("error", "start", str(error)), *unidentifiable(robot)]
         return found
-    mass, share = _mass(pose)
+    mass, share = moving_mass(pose)
     found.figures["start"] = _pose_figures(pose, mass, share)
     found.remarks += about_start(pose, robot.torque_limit if scene is None else scene.torque_limit)
     if modes:
@@ -171,7 +171,7 @@ def _rod_figures(robot: Robot, i: int) -> dict[str, Any]:
     }
 
 
-def _mass(eq: Equilibrium) -> tuple[np.ndarray, float]:
+def moving_mass(eq: Equilibrium) -> tuple[np.ndarray, float]:
     """Mass that moves with the tip, shape (2, 2) [kg], and the largest share of the rods in it."""
     robot = eq.robot
     tip = robot.tip_mass * np.eye(2)

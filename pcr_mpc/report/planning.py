@@ -28,6 +28,13 @@ _NONE = "none of them"
 _HARDLY = 0.05  # share below which a limit is not drawn
 
 
+_LIGHT = 0.01  # share of the rods in the mass that moves, below which nobody is told
+_LEFT_OUT = (
+    "rods        {:.0f} % of the mass that moves, left out of the plan: lower [limits] of the scene leave room for them;\n"
+    '            track the plan with inertia = "condensed" in the scene\'s [plant] to see how much it takes'
+)
+
+
 def plan_table(summary: dict[str, Any]) -> str:
     """Figures of a plan."""
     rows = [
@@ -41,13 +48,14 @@ def plan_table(summary: dict[str, Any]) -> str:
         )
         for row in summary["limits"]
     ]
-    excess = summary["largest_excess"]
+    excess, rods = summary["largest_excess"], summary.get("share_of_rods", 0.0)
     kept = f"kept, {-100 * excess:.3f} % are left" if excess <= 0 else f"exceeded by {100 * excess:.3f} %"
     lines = [
         f"scene       {summary['scene']}",
         f"duration    {summary['duration_s']:.4f} s, rest to rest",
         f"path        {summary['length_mm']:.1f} mm, within {summary['deviation_mm']:.3g} mm of the reference's",
         f"top speed   {summary['top_speed_m_s']:.3g} m/s",
+        *([_LEFT_OUT.format(100 * rods)] if rods > _LIGHT else []),
         "",
         table(("limit", "value", "unit", "most used [%]", "at [s]", "acts [% of time]"), rows),
         "",
