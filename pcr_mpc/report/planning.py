@@ -30,7 +30,7 @@ _HARDLY = 0.05  # share below which a limit is not drawn
 
 _LIGHT = 0.01  # share of the rods in the mass that moves, below which nobody is told
 _LEFT_OUT = (
-    "rods        {:.0f} % of the mass that moves, left out of the plan: lower [limits] of the scene leave room for them;\n"
+    "rods        {:.0f} % of the mass that moves, left out of the plan: lower [limits] of the scene leave room;\n"
     '            track the plan with inertia = "condensed" in the scene\'s [plant] to see how much it takes'
 )
 
