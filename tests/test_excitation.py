@@ -53,6 +53,18 @@ def test_what_is_written_can_be_tracked_within_the_limits(written):
     assert max(record["limits_used"].values()) <= 1.0
 
 
+def test_the_rods_are_not_strained_beyond_their_limit():
+    scene = load_scene(SCENE)
+    at_rest = scene.start().max_strain.max()
+    rods = tuple(replace(rod, strain_limit=1.2 * at_rest) for rod in scene.robot.rods)
+    scene = replace(scene, robot=replace(scene.robot, rods=rods))
+    found = excite(scene, 1.0, trials=1).best
+    asked = replace(scene, duration=1.0, trajectory=found.trajectory)
+    most = feed_forward(asked, asked.robot, asked.start(), 0).strains.max()
+    assert at_rest < most <= (1 + 0.6 * 0.2) * at_rest
+    assert found.use["strain"] <= 1.0
+
+
 @pytest.mark.slow
 def test_it_promises_more_than_the_lemniscate():
     found = excite(load_scene(SCENE), 4.0, trials=6)

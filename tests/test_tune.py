@@ -19,7 +19,7 @@ from pcr_mpc.errors import StudyError
 from pcr_mpc.report.trade_off import pareto
 from pcr_mpc.study import tuning_score, tuning_space, tuning_study
 from pcr_mpc.study.episodes import EXACT, Spread
-from pcr_mpc.study.tuning_file import default_path, write_tuning
+from pcr_mpc.study.tuning_file import default_path, to_tune, write_tuning
 from pcr_mpc.study.tuning_score import Costs, measure, score
 
 from .conftest import CONTROLLERS, MODELS
@@ -343,6 +343,14 @@ def test_tune_writes_a_tuning_that_beats_its_start(tmp_path, monkeypatch, capsys
         assert words in text
     assert (tmp_path / "results/tune/pick_and_place/trade_off.png").stat().st_size > 10_000
     assert len((tmp_path / "results/tune/pick_and_place/trials.csv").read_text().splitlines()) == 4
+
+
+def test_a_new_robot_s_tuning_bears_its_name_and_is_what_is_tuned(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "mine", "--length", "0.5"]) == 0
+    scene, known = to_tune(tmp_path / "mine" / "scene.toml")
+    assert scene.tuning.name == scene.name == "mine"
+    assert known is None
 
 
 def test_a_scene_that_was_tuned_is_tuned_from_the_default_again(tmp_path, monkeypatch):

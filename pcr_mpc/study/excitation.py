@@ -146,8 +146,8 @@ def excite(
     """Search for the multi-sine whose worst expected standard deviation is least (E-optimal in the numbers).
 
     Standard deviations are over what is believed; the tip is taken to be weighed, for motion does not tell the scale.
-    Each candidate is as large as limits on rate, change of rate, torque, tip region and distance to folds allow, with
-    something to spare.
+    Each candidate is as large as limits on rate, change of rate, torque, strain, tip region and distance to folds
+    allow, with something to spare.
 
     Parameters
     ----------
@@ -297,6 +297,11 @@ def _use(scene: Scene, reference: InverseDynamics) -> dict[str, float]:
         "change of rate": float(np.abs(changes).max()) / (_USED * limits[1]),
         "torque": float(((np.abs(torques) - held) / (_USED * np.maximum(limits[2] - held, 1e-12))).max()),
     }
+    limited = np.isfinite(scene.strain_limits)
+    if limited.any():
+        strains, most = reference.strains[:, limited], scene.strain_limits[limited]
+        left = np.maximum(most - strains[0], 1e-12 * most)
+        found["strain"] = float(((strains - strains[0]) / (_USED * left)).max())
     stops, angles = robot.angle_limits, reference.states[:, 4:]
     room = np.minimum(angles[0] - stops[:, 0], stops[:, 1] - angles[0])
     found["stops"] = float((np.abs(angles - angles[0]).max(axis=0) / np.maximum(0.9 * room, 1e-12)).max())

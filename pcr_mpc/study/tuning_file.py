@@ -23,8 +23,9 @@ def default_path(scene_file: Path, name: str) -> Path:
 def to_tune(scene_file: Path, start: Path | None = None) -> tuple[Scene, Tuning | None]:
     """Scene with the tuning that a search is to beat, and what an earlier search has found for it.
 
-    By default that is the scene's own tuning. One that bears the scene's name is from an earlier search: then it is
-    default.toml beside it, as it was for that search, and what was found is there to be found again.
+    By default that is the scene's own tuning. One that bears the scene's name, in a file of that name, is from an
+    earlier search: then it is default.toml beside it, as it was for that search, and what was found is there to be
+    found again.
 
     Raises
     ------
@@ -38,7 +39,12 @@ def to_tune(scene_file: Path, start: Path | None = None) -> tuple[Scene, Tuning 
             file=str(scene_file),
             key="reference.kind",
         )
-    if scene.tuning is not None and scene.tuning.name == scene.name:
+    named = Path(read_toml(scene_file).table("control").text("tuning")).name
+    if (
+        scene.tuning is not None
+        and scene.tuning.name == scene.name
+        and named == default_path(scene_file, scene.name).name
+    ):
         known = scene.tuning
         if start is None and not (start := default_path(scene_file, "default")).is_file():
             raise ModelError(
