@@ -187,6 +187,8 @@ def plot(rows: Sequence[dict[str, Any]], study: Map, path: Path) -> None:
         axis.plot(x + 0.5, y + 0.5, "x", color="white", ms=4, mew=1.2)
         axis.plot(x + 0.5, y + 0.5, "x", color="black", ms=4, mew=0.6)
         for j in range(len(study.y)):  # the edge before the first cell that is predicted to be lost
+            if np.isnan(radius[j]).any():
+                continue
             edge = next((i for i, each in enumerate(radius[j]) if each >= 1.0), len(study.x))
             axis.plot([edge, edge], [j, j + 1], color=RED, lw=2.5, clip_on=False)
         axis.set_xticks(np.arange(len(study.x))[::2] + 0.5, [f"{each:g}" for each in study.x[::2]])
@@ -197,8 +199,9 @@ def plot(rows: Sequence[dict[str, Any]], study: Map, path: Path) -> None:
     for axis in axes[:, 0]:
         axis.set_ylabel(study.y_label)
     if shades is not None:
-        figure.colorbar(shades, ax=axes, label="RMS error after 1 s [mm]; grey: ended early, or not run")
-    figure.suptitle("crosses: a small push does not die away; line: predicted to be lost beyond")
+        figure.colorbar(shades, ax=axes, label="RMS error after 1 s [mm]")
+    figure.suptitle("line: predicted to be lost beyond\ncross: a small push does not die away\n"
+                    "grey: ended early, or not run", fontsize=10)  # fmt: skip
     save_figure(figure, path)
 
 
