@@ -173,3 +173,10 @@ def test_measured_and_predicted_delay_margins_agree(lemniscate, name):
         # From a bad guess, so that what is found is not what was said.
         found = measure_delay_margin(lemniscate, tuning, p=p, guess=1.5 * margin.value)
         assert found.value == pytest.approx(margin.value, rel=0.15)
+
+
+def test_what_was_carried_and_put_down_is_no_more_in_the_model():
+    scene = load_scene(MODELS / "scenes" / "payload.toml")
+    before, carrying, after = (delay_margin(loop) for loop in LinearLoops(scene, poses=3).all())
+    assert carrying > 1.2 * before
+    assert after == pytest.approx(before, rel=0.05)

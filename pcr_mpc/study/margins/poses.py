@@ -124,8 +124,8 @@ class LinearLoops:
         for k in sorted({round(k) for k in np.linspace(0, scene.n_periods - 1, count).tolist()}):
             x, t = reference.states[k], k * period
             payload = float(scene.carried(np.array([t]))[0])
-            if payload and tuning.model.payload:
-                model.carry(payload, x)
+            if tuning.model.payload and scene.payload is not None:
+                model.carry(payload, x)  # or put it down again
             there: LinearModel = linearise(model, x, np.zeros(n), period)
             _, stiffness, by_angle = target.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
             believed = Believed(there, stiffness.copy(), by_angle.copy(), None if observer is None else observer.gain,
