@@ -11,6 +11,7 @@ from pcr_mpc.codegen.scope import check_scope
 from pcr_mpc.control.tuning import LearningTuning
 from pcr_mpc.errors import GenerationError, ModelError
 from pcr_mpc.loop.feed_forward import feed_forward
+from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.learning.harmonics import Harmonics
 from pcr_mpc.loop.learning.laps import laps_of
 from pcr_mpc.loop.learning.learner import Learner
@@ -139,6 +140,16 @@ def test_laps_get_better_until_noise_is_left(scene):
     assert taught.limit_violations() == 0
 
 
+def test_tips_that_are_late_and_rare_are_learnt_from(scene):
+    """A camera every second period, 25 ms late; the controller knows that."""
+    rods = tuple(replace(rod, bending_stiffness=0.9 * rod.bending_stiffness) for rod in scene.robot.rods)
+    seen = replace(learning(scene), camera=Camera(0.025, every=2), duration=3.5)
+    tuning = replace(seen.tuning, observer=replace(seen.tuning.observer, latency=0.025))
+    seen, true = replace(seen, tuning=tuning), replace(seen, robot=replace(seen.robot, rods=rods))
+    laps = simulate(true, true.make_plant(), make_controller(seen), 0).lap_errors()
+    assert laps[2] < 0.35 * laps[0]
+
+
 def test_what_is_noise_is_not_learnt(scene):
     """With the robot as believed and noise, learning that is on changes nothing, to the last bit."""
     known = replace(scene, tip_noise=1e-4, duration=3.5)
@@ -210,10 +221,16 @@ def test_tunings_and_records_keep_it(scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_shows_the_laps(tmp_path, capsys):
+def test_the_command_shows_the_laps(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("pcr_mpc.cli_track.animate_run", lambda run, path, progress: path.write_bytes(b"GIF89a"))
     text = (CONTROLLERS / "lemniscate.toml").read_text(encoding="utf-8")
     (tmp_path / "learns.toml").write_text(text + "\n[learning]\non = true\n")
-    scene = str(MODELS / "scenes" / "lemniscate.toml")
+    text = (
+        (MODELS / "scenes" / "lemniscate.toml").read_text(encoding="utf-8").replace("duration = 6.0", "duration = 5.0")
+    )
+    text = text.replace("../../controllers", str(CONTROLLERS)).replace("../planar_pair", str(MODELS / "planar_pair"))
+    (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
+    scene = str(tmp_path / "scene.toml")
     assert main(["track", scene, "--controller", str(tmp_path / "learns.toml"), "--out", str(tmp_path / "run")]) == 0
     assert "learning: RMS of each lap at full speed" in capsys.readouterr().out
     assert (tmp_path / "run" / "laps.png").stat().st_size > 10_000

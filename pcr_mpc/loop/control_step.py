@@ -228,6 +228,8 @@ class ControlStep:
             x = np.concatenate([x[:2] + (expected[:2] - past.tip(expected)), x[2:]])
         found = self._gate.sift(k, x, expected, observer is None)
         self.k, self.believed = k, (found.p is not None, found.q is not None)
+        if self.learner is not None:
+            self.learner.see(k, found.p)
         if observer is None:
             if found.p is not None:
                 expected[:2], expected[2:4] = found.p, x[2:4] if found.velocity is None else found.velocity
@@ -242,8 +244,6 @@ class ControlStep:
             expected[:4] += change[:4]
             foresight.force[:] += change[4:]
             found.p = None  # it is done with
-        if self.learner is not None:
-            self.learner.see(k, found.p)
         p = expected[:2] if found.p is None else found.p
         foresight.inputs["measured"][:] = [*p, *(expected[4:] if found.q is None else found.q)]
         return found.events

@@ -38,7 +38,9 @@ _TOO_MUCH, _DEVIATIONS = 0.08, 3.0
 _FADE = 0.15  # s, at most, and at most this part of a lap:
 _FADE_SHARE = 0.1
 _MOST_OF_RATE = 0.1  # of the control rate, as bandwidth
-_SEEN = 0.8  # share of a lap's measurements without which nothing is learnt from it
+# Share of a lap's measurements that is enough to learn from it; or the longest time between two, over that of the
+# fastest turn that is learnt.
+_SEEN, _OFTEN = 0.8, 0.25
 
 
 @dataclass(eq=False)
@@ -153,13 +155,13 @@ class Learner:
         off, seen = self._off[begin:end], ~np.isnan(self._off[begin:end, 0])
         spoilt, self._spoilt = self._spoilt, False
         self.powers.append(float(np.mean(np.sum(off[seen] ** 2, axis=1))) if seen.any() else math.nan)
-        if seen.mean() < _SEEN:
+        if not self._enough(seen):
             return
         if not len(self._first):
             self._first = np.cumsum(np.nansum(off**2, axis=1))
         power, best = self.powers[-1] - self._noise, self._best
         # The mean power of noise is known to no better than this.
-        slack = _DEVIATIONS * self._noise * math.sqrt(2.0 / len(off))
+        slack = _DEVIATIONS * self._noise * math.sqrt(2.0 / int(seen.sum()))
         if not spoilt and power <= _WORSE**2 * max(best.power, 0.0) + slack:
             places = self._clock[0][begin:end][seen]
             added, _ = self._harmonics.found(places, self._added[begin:end, 0][seen])
@@ -172,6 +174,11 @@ class Learner:
         step = self.tuning.gain * self._share * clear[:, None] * best.off
         if step.any() or spoilt:
             self._change(end, best.added - step)
+
+    def _enough(self, seen: np.ndarray) -> bool:
+        """Whether a lap was seen well enough: nearly always, or often enough for what is learnt."""
+        at = np.flatnonzero(np.concatenate([[True], seen, [True]]))
+        return bool(seen.mean() >= _SEEN or np.diff(at).max() * self._period * self.tuning.bandwidth <= _OFTEN)
 
     def _change(self, k: int, coefficients: np.ndarray) -> None:
         """Go over to other harmonics, from the first period on that a decision in period k can change."""
