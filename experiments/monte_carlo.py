@@ -59,8 +59,8 @@ DEFAULT_SCENE = MODELS / "scenes" / "lemniscate.toml"
 
 # Kinds of mismatch, as they are drawn from top to bottom.
 KINDS = (
-    "delay", "load", "bending stiffness", "tip mass", "drag", "bases", "lengths", "line density", "tip noise",
-    "encoder step",
+    "delay", "motor lag", "load", "bending stiffness", "tip mass", "drag", "bases", "lengths", "line density",
+    "tip noise", "encoder step",
 )  # fmt: skip
 
 
@@ -78,6 +78,7 @@ def sizes(row: Row) -> dict[str, float]:
         "lengths": off("length", 1.0),
         "line density": off("line_density", 1.0),
         "delay": off("delay", 0.0),
+        "motor lag": off("motor_lag", 0.0),
         "tip noise": off("tip_noise", 0.0),
         "encoder step": off("angle_step", 0.0),
         "load": off("force", 0.0),
@@ -261,6 +262,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="robot that the controller believes in, as `pcr-mpc identify --out` writes it: how far off its numbers "
         "are is drawn from its [uncertainty], not from assumed ranges",
     )  # fmt: skip
+    parser.add_argument("--motor-lag", type=float, default=0.0, metavar="SECONDS",
+                        help="motors lag by up to this, which the controller does not know (default 0)")  # fmt: skip
+    parser.add_argument("--delay", type=int, metavar="PERIODS", help="of commands, untold, up to this many (default 1)")
     parser.add_argument("--replay", type=int, metavar="SEED", help="run this one episode in full, with pictures")
     parser.add_argument("--fresh", action="store_true", help="discard the finished episodes in that folder first")
     parser.add_argument("--quick", action="store_true", help="8 episodes of 1.2 s")
@@ -299,6 +303,8 @@ def _study(options: argparse.Namespace) -> int:
     scene, spread = load_scene(options.scene), Spread()
     if options.robot:
         scene, spread = as_known(scene, options.robot)
+    spread = replace(spread, motor_lag=options.motor_lag,
+                     delay=spread.delay if options.delay is None else options.delay)  # fmt: skip
     tuning: Tuning | OwnController | None = scene.tuning
     if options.controller:
         own = isinstance(options.controller, str)
@@ -322,7 +328,7 @@ def _study(options: argparse.Namespace) -> int:
     seeds = range(options.seed, options.seed + episodes)
     settings = {**described(scene, tuning, spread), "code": source_digest()}
     with workers(options.jobs, options.dask) as executor:
-        task = partial(run_episode, scene, tuning, **({"spread": spread} if options.robot else {}))
+        task = partial(run_episode, scene, tuning, **({"spread": spread} if spread != Spread() else {}))
         rows = collect(executor, task, seeds, journal, settings, desc=scene.name)
     summary = summarise(rows)
     timing = [row["timing"] for row in rows if row["timing"]["control_cpu_us"] is not None]
@@ -340,6 +346,8 @@ def _again(options: argparse.Namespace) -> str:
     parts = ["python experiments/monte_carlo.py"]
     parts += [f"--scene {options.scene}"] if options.scene != DEFAULT_SCENE else []
     parts += [f"--robot {options.robot}"] if options.robot else []
+    parts += [f"--motor-lag {options.motor_lag:g}"] if options.motor_lag else []
+    parts += [f"--delay {options.delay}"] if options.delay is not None else []
     parts += [f"--controller {options.controller}"] if options.controller else []
     parts += ["--quick"] if options.quick else [f"--duration {options.duration:g}"]
     parts += [f"--out {options.out}"] if options.out else []

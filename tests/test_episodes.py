@@ -293,3 +293,17 @@ def test_a_deadline_does_not_make_an_episode_depend_on_the_machine(scene):
     late = run_episode(replace(scene, deadline=0.0, duration=0.1), scene.tuning, 2)
     in_time = run_episode(replace(scene, duration=0.1), scene.tuning, 2)
     assert repeatable(late) == repeatable(in_time)
+
+
+def test_motors_that_lag_leave_all_else_of_a_seed_as_it_was():
+    """The lag is drawn beside the rest, within its range, and reaches the motors that move, not the controller's."""
+    plain, lagging = Spread(), Spread(motor_lag=0.02)
+    drawn = [lagging.sample(2, seed) for seed in range(40)]
+    assert [replace(one, motor_lag=0.0) for one in drawn] == [plain.sample(2, seed) for seed in range(40)]
+    lags = [one.motor_lag for one in drawn]
+    assert 0.0 <= min(lags) < 0.005 < 0.015 < max(lags) <= 0.02
+    scene = load_scene(MODELS / "scenes" / "servo.toml")
+    assert drawn[0].applied_to(scene).motors.time_constant == pytest.approx(0.02 + lags[0])
+    assert "motor_lag_s" in drawn[0].row()
+    assert "motor_lag_s" not in plain.sample(2, 0).row()
+    assert plain.sample(2, 0).applied_to(scene).motors == scene.motors

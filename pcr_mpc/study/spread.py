@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import checked_integer, checked_number
+from ..loop.hardware.motors import Motors
 from ..loop.scene import Scene
 from ..plant.robot import Robot
 from ..plant.uncertainty import Uncertainty
@@ -40,6 +41,8 @@ class Mismatch:
         External force on the tip, beside the scene's own [N].
     length, line_density : tuple of float, one a rod
         True lengths and line densities over the believed ones. Empty: they are as believed.
+    motor_lag : float
+        First-order lag of the motors, beside the scene's own [s]; the controller does not know it.
     """
 
     stiffness: tuple[float, ...]
@@ -52,6 +55,7 @@ class Mismatch:
     force: tuple[float, float]
     length: tuple[float, ...] = ()
     line_density: tuple[float, ...] = ()
+    motor_lag: float = 0.0
 
     def applied_to(self, scene: Scene) -> Scene:
         """Return the scene as it really is."""
@@ -83,7 +87,14 @@ class Mismatch:
             tip_noise=math.hypot(scene.tip_noise, self.tip_noise),
             angle_step=max(scene.angle_step, self.angle_step),
             force=(scene.force[0] + self.force[0], scene.force[1] + self.force[1]),
+            motors=self._motors(scene.motors),
         )
+
+    def _motors(self, own: Motors | None) -> Motors | None:
+        if not self.motor_lag:
+            return own
+        own = own or Motors()
+        return replace(own, time_constant=own.time_constant + self.motor_lag)
 
     def row(self) -> Row:
         """Plain columns, with units in their names."""
@@ -100,6 +111,7 @@ class Mismatch:
             "force_y_N": self.force[1],
             **{f"length{i}": factor for i, factor in enumerate(self.length)},
             **{f"line_density{i}": factor for i, factor in enumerate(self.line_density)},
+            **({"motor_lag_s": self.motor_lag} if self.motor_lag else {}),
         }  # fmt: skip
 
 
@@ -134,6 +146,8 @@ class Spread:
         How well numbers of the robot are known (see `load_uncertainty`); those that it does not name keep their ranges.
     believed : Robot, optional
         Whose numbers these are: with ``known``, the robot that the controller believes in.
+    motor_lag : float
+        0 to this first-order lag of the motors [s]: a hobby servo has 10 to 30 ms. All else of a seed is as without.
     """
 
     stiffness: float = 0.1
@@ -146,11 +160,12 @@ class Spread:
     force: float = 1.0
     known: Uncertainty | None = None
     believed: Robot | None = None
+    motor_lag: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("stiffness", "mass"):
             checked_number(name, getattr(self, name), minimum=0.0, maximum=0.99)
-        for name in ("base_offset", "delay", "tip_noise", "angle_step", "force"):
+        for name in ("base_offset", "delay", "tip_noise", "angle_step", "force", "motor_lag"):
             checked_number(name, getattr(self, name), minimum=0.0)
         checked_number("drag", self.drag, minimum=1.0)
         if (self.known is None) != (self.believed is None):
@@ -175,6 +190,7 @@ class Spread:
             tip_noise=self.tip_noise * rng.uniform(),
             angle_step=self.angle_step * rng.uniform(),
             force=(size * math.cos(direction), size * math.sin(direction)),
+            motor_lag=self.motor_lag * np.random.default_rng([seed, 4]).uniform() if self.motor_lag else 0.0,
         )
         return ranges if self.known is None else self._told(ranges, n_rods, seed)
 
