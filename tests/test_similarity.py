@@ -210,7 +210,7 @@ def test_tracking(units, name):
 @pytest.mark.parametrize("input_weight", [1.0, 1e3])
 def test_plans_are_as_sharp_in_any_units(pair, centre, units, solver, input_weight):
     """A solver that stops early stops at the same place: its tolerance is one of angles, not of rad/s."""
-    tuning = replace(load_tuning(CONTROLLERS / "default.toml"), solver=solver, tolerance=1e-3)
+    tuning = replace(load_tuning(CONTROLLERS / "measured.toml"), solver=solver, tolerance=1e-3)
     tuning = replace(tuning, input_weight=input_weight * tuning.input_weight)
     plans = []
     for of, (model, x) in zip((units, Units(1.0, 1.0, 1.0)), models(pair, units, centre, 0.01), strict=True):
@@ -246,7 +246,7 @@ def assert_similar(units, name):
 
 def test_nonlinear_plans(pair, centre, units):
     """IPOPT sees the same problem, of order one, whatever the robot is measured in."""
-    tuning = replace(load_tuning(CONTROLLERS / "default.toml"), horizon=3)
+    tuning = replace(load_tuning(CONTROLLERS / "measured.toml"), horizon=3)
     plans = []
     for of, (model, x) in zip((units, Units(1.0, 1.0, 1.0)), models(pair, units, centre, 0.01), strict=True):
         robot = of.robot(pair)
