@@ -28,7 +28,7 @@ from .packet import RESTING, Measurement, command_size, pack_measurement, unpack
 
 _PATIENCE = 120.0  # s, until the controller's process listens
 _HEAD_START = 0.05  # s
-_SILENCE, _SILENCE_TIME = 5, 0.05  # periods at least, and s
+_SILENCE, _SILENCE_TIME = 5, 0.25  # periods at least, and s
 _SPIN = 1e-4  # s before a step is due, in which sleeping is too coarse
 
 
@@ -172,7 +172,7 @@ def _controller(scene: Scene, generated: bool, pipe: Connection) -> None:
     from .decider import make_decider
     from .server import Server
 
-    # A process that is kept waiting by others for some milliseconds has not fallen silent.
+    # A process that is kept waiting by others, a tenth of a second now and then, has not fallen silent.
     silence = max(_SILENCE, math.ceil(_SILENCE_TIME / scene.period))
     try:
         server = Server(make_decider(scene, generated=generated), ("127.0.0.1", 0), silence=silence)
