@@ -72,7 +72,9 @@ def test_cold_start_of_any_pull_and_clamp(pair, seed, count):
         ):
             pull = np.hypot(*n) / unit
             if pull > 900:  # exp(-30) from the separatrix
-                # The rounding of the tip position counts twice in the force.
+                # What the tip is off by counts twice in the force. Of the 12 worst of 2500 poses, against 50 digits,
+                # this formula is off by 0.25e-15 / slack at most, the rods by 1.4e-15 / slack: roundings of the tip,
+                # which stay when a pose is solved again from its solution.
                 assert pull == pytest.approx(pull_of(slack, angle), rel=1e-8 + 2e-15 / slack)
                 taut += 1
                 stiffest = max(stiffest, pull)
