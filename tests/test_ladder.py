@@ -28,7 +28,7 @@ DT, RATE, CHANGE = 0.01, 6.0, 1.0
 @pytest.fixture(scope="module")
 def tuning():
     # Steps of centimetres under narrow limits take OSQP longer than the default allows.
-    return replace(load_tuning(CONTROLLERS / "default.toml"), max_iterations=4000)
+    return replace(load_tuning(CONTROLLERS / "measured.toml"), max_iterations=4000)
 
 
 @pytest.fixture(scope="module")

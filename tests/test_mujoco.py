@@ -275,7 +275,7 @@ def short(tmp_path):
 
 def test_track(short, tmp_path, capsys):
     arguments = ["track", str(short), "--plant", "mujoco", "--links", "10", "--no-pictures", "--out", str(tmp_path),
-                 "--controller", str(CONTROLLERS / "default.toml")]  # fmt: skip
+                 "--controller", str(CONTROLLERS / "measured.toml")]  # fmt: skip
     assert main([*arguments, "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["plant"] == f"MuJoCo {mujoco.__version__}, 10 links, discrete at 500 us extrapolated, dt = 1 ms"

@@ -35,7 +35,7 @@ def make_nonlinear_mpc(robot, pose, tuning, limits, **options):
 
 @pytest.fixture(scope="module")
 def tuning():
-    return replace(load_tuning(CONTROLLERS / "default.toml"), horizon=5)  # IPOPT takes long to set up
+    return replace(load_tuning(CONTROLLERS / "measured.toml"), horizon=5)  # IPOPT takes long to set up
 
 
 @pytest.fixture(scope="module")

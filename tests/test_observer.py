@@ -15,7 +15,7 @@ SCENES = MODELS / "scenes"
 
 @pytest.fixture(scope="module")
 def tuning():
-    return load_tuning(CONTROLLERS / "default.toml")
+    return load_tuning(CONTROLLERS / "measured.toml")
 
 
 @pytest.fixture(scope="module")

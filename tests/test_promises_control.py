@@ -223,11 +223,12 @@ def test_a_tuning_that_makes_no_sense_is_refused(tuning, name, values):
 
 
 def test_what_a_model_or_an_observer_cannot_be_is_refused():
-    for name in ("method", "scheme", "inertia", "linearise"):
+    for name in ("method", "scheme", "inertia", "linearise", "angles"):
         with pytest.raises(ValueError, match=f"{name} is 'magic', expected one of"):
             Model(**{name: "magic"})
     for field in fields(ObserverTuning):
-        for value in (0.0, -1e-9, math.nan):
+        # No latency is one, too; and what is adapted are names.
+        for value in {"adapts": (("inertia",),), "latency": (-1e-9, math.nan)}.get(field.name, (0.0, -1e-9, math.nan)):
             with pytest.raises(ValueError, match=field.name):
                 ObserverTuning(**{field.name: value})
 
@@ -237,8 +238,9 @@ TOML = {
     "input": "5.0"}, "solver": {"name": '"daqp"', "tolerance": "1e-6", "max_iterations": "11", "fallback": '"raise"'},
     "model": {"method": '"multiple_shooting"', "segments": "3", "steps": "2", "scheme": '"rk4"',
     "inertia": '"condensed"', "linearise": '"along_plan"', "payload": "false", "predict_delay": "false",
-    "compiled": "false"},
-    "observer": {"on": "true", "tip_noise": "1e-4", "force_noise": "0.02", "force_walk": "0.03"},
+    "angles": '"commanded"', "motor_lag": "0.04", "compiled": "false"},
+    "observer": {"on": "true", "tip_noise": "1e-4", "force_noise": "0.02", "force_walk": "0.03",
+    "adapts": '["stiffness"]', "adapt_walk": "0.05"},
 }  # fmt: skip
 
 
@@ -261,9 +263,11 @@ def test_every_setting_of_a_file_arrives(tmp_path):
     assert (tuning.position_weight, tuning.velocity_weight, tuning.angle_weight, tuning.input_weight) == (2, 3, 4, 5)
     assert (tuning.solver, tuning.tolerance, tuning.max_iterations) == ("daqp", 1e-6, 11)
     assert [getattr(tuning.model, f.name) for f in fields(tuning.model)] == [
-        "multiple_shooting", 3, 2, "rk4", "condensed", "along_plan", False, False, False,
+        "multiple_shooting", 3, 2, "rk4", "condensed", "along_plan", False, False, "commanded", 0.04, False,
     ]  # fmt: skip
-    assert tuning.observer == ObserverTuning(1e-4, 0.02, 0.03)
+    assert tuning.observer == ObserverTuning(1e-4, 0.02, 0.03, ("stiffness",), 0.05)
+    late = load_tuning(written(tmp_path / "t.toml", {**TOML, "observer": {"on": "true", "latency": "0.06"}}))
+    assert late.observer == replace(ObserverTuning(), latency=0.06)
     assert load_tuning(written(tmp_path / "t.toml", TOML, [("observer", "on", "false")])).observer is None
     # A period of none is the scene's.
     assert load_tuning(written(tmp_path / "t.toml", TOML, [("", "period", "0")])).period is None

@@ -53,10 +53,14 @@ def in_earnest(few, many, check, *strategies):
 
 @pytest.fixture
 def count():
-    """Of cases, and of those that came to the assertion: most, or the test says nothing."""
+    """Of cases, and of those that came to the assertion: few of them, and the test says nothing.
+
+    About two thirds do. Hypothesis draws constants of all modules that are loaded, too: the same 30 cases are others in
+    another company, and their share varies by a tenth.
+    """
     counted = Counter()
     yield counted
-    assert counted["reached"] > 0.6 * counted["cases"] > 0, counted
+    assert counted["reached"] > 0.4 * counted["cases"] > 0, counted
 
 
 def mostly(ordinary, *others):

@@ -11,7 +11,7 @@ from pcr_mpc import cli
 from .conftest import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-RUN_ELSEWHERE = ("README.md", "your_loop.md")  # below, and in test_your_loop
+RUN_ELSEWHERE = ("README.md", "your_loop.md", "identification.md")  # below, in test_your_loop, in test_identification
 
 
 def blocks(page, language):

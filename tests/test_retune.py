@@ -17,7 +17,7 @@ from pcr_mpc.loop.parts import motor_limits
 
 from .conftest import CONTROLLERS, MODELS
 
-TUNING = replace(load_tuning(CONTROLLERS / "default.toml"), horizon=5, law="linear_mpc")
+TUNING = replace(load_tuning(CONTROLLERS / "measured.toml"), horizon=5, law="linear_mpc")
 CHANGES = {
     "weights": {"input_weight": 0.3, "velocity_weight": 50.0},
     "angle weight": {"angle_weight": 10.0},
@@ -141,7 +141,7 @@ def absurd(kind, target, model, limits):
                                   "still"])  # fmt: skip
 @pytest.mark.parametrize("prepared", [True, False])
 def test_an_absurd_problem_does_not_spoil_the_next(pair, target, model, kind, prepared):
-    tuning = replace(load_tuning(CONTROLLERS / "default.toml"), horizon=10)
+    tuning = replace(load_tuning(CONTROLLERS / "measured.toml"), horizon=10)
     limits = motor_limits(pair, 0.01)
     mpc, fresh = LinearMPC(tuning, limits), LinearMPC(tuning, limits)
     for one in (mpc, fresh):

@@ -42,7 +42,7 @@ class Shuffled(Here):
 
 @pytest.fixture(scope="module")
 def scene():
-    scene = load_scene(MODELS / "scenes" / "lemniscate.toml").tuned(load_tuning(CONTROLLERS / "default.toml"))
+    scene = load_scene(MODELS / "scenes" / "lemniscate.toml").tuned(load_tuning(CONTROLLERS / "measured.toml"))
     return replace(scene, duration=0.1)
 
 
@@ -277,7 +277,7 @@ def test_without_optuna_it_says_what_to_install(search, monkeypatch):
 
 
 def test_a_written_tuning_reads_back(tmp_path):
-    tuning = load_tuning(CONTROLLERS / "default.toml")
+    tuning = load_tuning(CONTROLLERS / "measured.toml")
     path = tmp_path / "new" / "mine.toml"
     model = replace(tuning.model, linearise="along_plan", predict_delay=False, segments=4, method="multiple_shooting",
                     scheme="rk4", steps=2, inertia="constant")  # fmt: skip

@@ -111,7 +111,12 @@ def _where_it_begins(start: Table, tip: tuple[float, ...], trajectory: Trajector
     apart = math.hypot(*(begin - tip)) / robot.lengths.mean()
     if apart > _START_SMOOTHING:
         said = "(" + ", ".join(f"{x:.6g}" for x in begin) + ")"
-        raise start.fail("tip", f"{tip} is not where the reference begins, {said}; without start.tip it starts there")
+        raise ModelError(
+            f"{start.path}: start.tip {tip} is not where the reference begins, {said}; without start.tip it starts "
+            "there",
+            file=str(start.path),
+            key="start.tip",
+        )
     return tip if apart <= _START_ROUNDING else tuple(begin.tolist())
 
 
