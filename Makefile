@@ -24,37 +24,37 @@ docs: $(READY)  ## the pages, in docs/_build/html; warnings are errors, and figu
 	$(BIN)/python -m experiments.text_figures
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 
-figures: $(READY)  ## the paper's figures and the README's pictures, in docs/
-	$(BIN)/python experiments/paper_figures.py --out docs
-	$(BIN)/python experiments/finite_differences.py --out docs
-	$(BIN)/python experiments/equilibria.py --out docs
-	$(BIN)/python experiments/time_step_limits.py --out docs
-	$(BIN)/python experiments/snap.py --out docs
-	$(BIN)/python experiments/rod_inertia.py --out docs
-	$(BIN)/python -m experiments.mujoco_agreement --out docs
-	$(BIN)/python -m experiments.growth --out docs
-	$(BIN)/python -m experiments.path_kinds --out docs
-	$(BIN)/python experiments/rungs.py --out docs
+figures: $(READY)  ## the paper's figures and the README's pictures, in docs/figures/
+	$(BIN)/python experiments/paper_figures.py --out docs/figures
+	$(BIN)/python experiments/finite_differences.py --out docs/figures
+	$(BIN)/python experiments/equilibria.py --out docs/figures
+	$(BIN)/python experiments/time_step_limits.py --out docs/figures
+	$(BIN)/python experiments/snap.py --out docs/figures
+	$(BIN)/python experiments/rod_inertia.py --out docs/figures
+	$(BIN)/python -m experiments.mujoco_agreement --out docs/figures
+	$(BIN)/python -m experiments.growth --out docs/figures
+	$(BIN)/python -m experiments.path_kinds --out docs/figures
+	$(BIN)/python experiments/rungs.py --out docs/figures
 	$(BIN)/python experiments/workspace.py --out results/workspace
-	cp results/workspace/*.png docs/
+	cp results/workspace/*.png docs/figures/
 	$(BIN)/python experiments/basins.py --seeds 3 --out results/basins
-	cp results/basins/*.png docs/
-	$(BIN)/python experiments/linear_validity.py --out docs
+	cp results/basins/*.png docs/figures/
+	$(BIN)/python experiments/linear_validity.py --out docs/figures
 	$(BIN)/python experiments/monte_carlo.py --episodes 500 --out results/monte_carlo/figure
-	cp results/monte_carlo/figure/monte_carlo.png docs/
+	cp results/monte_carlo/figure/monte_carlo.png docs/figures/
 	$(BIN)/python experiments/fold_guard.py --out results/fold_guard
 	$(BIN)/python experiments/controllers.py --out results/controllers
-	cp results/fold_guard/*.png results/controllers/*.png docs/
+	cp results/fold_guard/*.png results/controllers/*.png docs/figures/
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
-	cp results/lemniscate/track.png results/lemniscate/track.gif docs/
+	cp results/lemniscate/track.png results/lemniscate/track.gif docs/figures/
 	$(BIN)/pcr-mpc timing models/scenes/lemniscate.toml --out results/timing
-	cp results/timing/timing.png docs/
+	cp results/timing/timing.png docs/figures/
 
-charts: $(READY)  ## speed against accuracy: three charts, their CSVs and the ratios, in docs/; wants an idle machine
+charts: $(READY)  ## speed against accuracy: three charts, their CSVs and the ratios, in docs/figures/; wants an idle machine
 	$(BIN)/python -m experiments.accuracy_vs_speed --out results/charts
-	cp results/charts/accuracy_vs_speed_* docs/
+	cp results/charts/accuracy_vs_speed_* docs/figures/
 
-benchmarks: $(READY)  ## ratios of ours to fixed references against those kept in docs/benchmarks.json
+benchmarks: $(READY)  ## ratios of ours to fixed references against those kept in docs/records/benchmarks.json
 	$(BIN)/python -m experiments.benchmarks
 
 N ?= 200

@@ -5,9 +5,9 @@ and the plant's step, IPOPT on the exact equations for control, massless rods fo
 what Python adds to it. Times are CPU times. So a ratio says more than a time on a computer that others use too. Every
 ratio is the reference over ours: the larger, the better.
 
-Prints the new ratios beside those of docs/benchmarks.json, and fails if one is worse than half of the old one, or than
-what is promised of it, in a second measurement as well. --write puts the new ones there, with the commit, and prints
-the table for CHANGELOG.md.
+Prints the new ratios beside those of docs/records/benchmarks.json, and fails if one is worse than half of the old one,
+or than what is promised of it, in a second measurement as well. --write puts the new ones there, with the commit, and
+prints the table for CHANGELOG.md.
 Run as ``python -m experiments.benchmarks``; it takes half a minute.
 """
 
@@ -49,7 +49,7 @@ from pcr_mpc.plant.rods.numbers import Kind
 from pcr_mpc.report.tables import table
 
 ROOT = Path(__file__).parent.parent
-KEPT = ROOT / "docs" / "benchmarks.json"
+KEPT = ROOT / "docs" / "records" / "benchmarks.json"
 WORST = 0.5  # of the old ratio
 # What Python may add to the graph that solves a pose: 1.5 and 0.1 of the 28 us that the graph took when that was
 # promised. It takes 10 us since, so that the same microseconds are a larger share of it.
@@ -205,7 +205,9 @@ def show(found: list[Change], *, markdown: bool = False) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and compare, or keep."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kept", type=Path, default=KEPT, help="what to compare with (default docs/benchmarks.json)")
+    parser.add_argument(
+        "--kept", type=Path, default=KEPT, help=f"what to compare with (default {KEPT.relative_to(ROOT)})"
+    )
     parser.add_argument("--write", action="store_true", help="keep the new ratios there, and print a table in Markdown")
     options = parser.parse_args(arguments)
     old: dict[str, Any] = json.loads(options.kept.read_text(encoding="utf-8")) if options.kept.exists() else {}

@@ -1,4 +1,4 @@
-"""What the kinds of path look like, and how fast the tip goes along each: docs/paths.png."""
+"""What the kinds of path look like, and how fast the tip goes along each: docs/figures/paths.png."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ def test_release_needs_the_condensed_mass(release, choice):
 
 def test_estimates_are_of_the_right_size():
     """By a factor of 1.5 too small to 3 too large, against what the neighbouring rungs differ by over the motion."""
-    expected = {  # mm; docs/rungs.csv
+    expected = {  # mm; docs/figures/rungs.csv
         "release": {"rods' inertia": 2.6},
         "payload": {"payload": 59.0, "rods' inertia": 0.68, "change of inertia": 0.11, "rods' vibration": 0.012},
         "vertical": {"rods' weight": 0.92, "rods' sag": 5e-4, "rods' inertia": 0.13, "change of inertia": 0.032},
