@@ -10,7 +10,6 @@ import pytest
 from pcr_mpc import ModelError, load_scene
 from pcr_mpc.cli import main
 from pcr_mpc.loop.finding import digest, verified
-from pcr_mpc.study import choice
 from pcr_mpc.study.choice import choose
 from pcr_mpc.study.chosen_rung import write_rung
 from pcr_mpc.study.rungs import ladders, levels
@@ -120,7 +119,9 @@ def test_the_seven_scenes_carry_verified_rungs_of_their_own():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHOSEN)
 def test_the_scenes_need_the_rungs_that_they_carry(name, monkeypatch):
-    monkeypatch.setattr(choice, "numbers_cost", lambda *_: None)  # tested elsewhere, and takes minutes if rods are shot
+    monkeypatch.setattr(
+        "pcr_mpc.study.choice.numbers_cost", lambda *_: None
+    )  # tested elsewhere, and takes minutes if rods are shot
     scene = load_scene(SCENES / f"{name}.toml")
     found = choose(replace(scene, need=replace(scene.need, plant_step=1.0, control_step=10.0)))
     assert found.chosen.rung == replace(scene.plant, weight=scene.plant.weight or "none")
