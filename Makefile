@@ -11,8 +11,8 @@ track: $(READY)  ## follow the figure of eight in closed loop; pictures and tabl
 test: $(READY)  ## the default test run
 	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
-test-slow: $(READY)  ## the tests marked slow
-	$(BIN)/python -m pytest -q -m slow -n auto --dist loadfile
+test-slow: $(READY)  ## the tests marked slow, but for those of minutes: -m longest
+	$(BIN)/python -m pytest -q -m "slow and not longest" -n auto --dist loadfile
 
 lint: $(READY)  ## style, types, layers
 	$(BIN)/ruff check .

@@ -117,6 +117,7 @@ def test_the_seven_scenes_carry_verified_rungs_of_their_own():
 
 
 @pytest.mark.slow
+@pytest.mark.longest
 @pytest.mark.parametrize("name", CHOSEN)
 def test_the_scenes_need_the_rungs_that_they_carry(name, monkeypatch):
     monkeypatch.setattr(
