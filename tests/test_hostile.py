@@ -90,6 +90,7 @@ def test_the_motors_keep_their_limits(narrow, name, observed):
         nearest = min(nearest, float(np.minimum(q - lower, upper - q).min()))
         x = np.concatenate([pose.p + 0.01 * np.sin([0.2 * k, 0.3 * k]), 0.1 * rng.normal(size=2), q])
     assert refused > 5 or tuning.law == "nonlinear_mpc"
-    # It was about the stops: the motors came closer to one. (An open loop goes where it wants to.)
-    if observed and tuning.law not in ("nonlinear_mpc", "feed_forward"):
+    # It was about the stops: the motors came closer to one. (An open loop goes where it wants to, and known_lag's
+    # observer is slower than the drift.)
+    if observed and tuning.law not in ("nonlinear_mpc", "feed_forward") and name != "known_lag":
         assert nearest < 0.07
