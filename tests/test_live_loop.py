@@ -154,6 +154,18 @@ def test_long_silence_ends_at_rest_and_is_taken_up_again(live, centre, scene):
     assert loop.error(scene.trajectory, 200) < 0.1
 
 
+def test_one_encoder_that_is_silent_is_said_and_ends_at_rest(live, centre):
+    loop = Loop(live, centre).run(20)
+    for bridged in range(1, 31):
+        loop.run(1, angles=[loop.x[4], None])
+        assert loop.events == ["measurement"] * bridged
+    loop.run(20, angles=[loop.x[4], None])
+    assert loop.events.count("rest") == 1
+    assert (loop.u == 0.0).all()
+    loop.run(20)
+    assert loop.events.count("resumed") == 1
+
+
 def test_after_a_pause_the_estimates_begin_anew(live, centre, scene):
     loop = Loop(live, centre).run(60)
     loop.wait(150)

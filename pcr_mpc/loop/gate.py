@@ -139,12 +139,11 @@ class Gate:
             else:
                 found.note("measurement", k, f"{text}; bridged by the prediction")
         self._without = self._without + 1 if p[0] != p[0] else 0
-        if 0 < self._without < self._every:
-            pass  # none is due
-        elif tip_why is None:
+        is_due = not 0 < self._without < self._every
+        if is_due and tip_why is None:
             self._tip.believed(math.hypot(p[0] - due[0], p[1] - due[1]))
             found.p = p
-        else:
+        elif is_due and tip_why is not None:
             text, unit = tip_why
             if self._first and unit:
                 raise MeasurementError(f"first measurement: {text}")

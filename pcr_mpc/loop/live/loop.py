@@ -239,10 +239,14 @@ class LiveLoop:
         # Back to where it was when the period began; what one encoder does not say the commands do.
         p, q = p - late * expected[2:4], q - late * core.turning
         missing = np.isnan(q)
-        if missing.any() and not missing.all():
+        some = bool(missing.any() and not missing.all())
+        if some:
             q = np.where(missing, expected[4:], q)
+            which = ", ".join(str(i) for i in np.flatnonzero(missing))
+            notes.append(("measurement", f"no angle of motor {which}; bridged by the commands"))
         decision = core.period_step(self.k, np.concatenate([p, np.zeros(2), q]))
-        self._silent = [0 if seen else count + 1 for seen, count in zip(core.believed, self._silent, strict=True)]
+        heard = core.believed[0], core.believed[1] and not some
+        self._silent = [0 if each else count + 1 for each, count in zip(heard, self._silent, strict=True)]
         if max(self._silent) > self._bridge:
             who = "the tip's sensor" if self._silent[0] > self._bridge else "the encoders"
             notes.append(("rest", f"{who} said nothing believable for {self._sensors.bridge:.3g} s: the motors are "

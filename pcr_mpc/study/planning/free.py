@@ -17,6 +17,7 @@ from .path import fitted
 
 _DEGREE, _FLAT = 7, 4  # at each end so many coefficients are alike: three derivatives vanish there
 _SAMPLES = 4001
+_MOST_POINTS = 100  # more are samples of a path, and no way-points
 
 
 class FreeCourse:
@@ -122,16 +123,16 @@ def way_points(trajectory: Trajectory) -> np.ndarray:
     if isinstance(trajectory, PickAndPlace):
         return np.array([trajectory.pick, trajectory.place])
     points = getattr(trajectory, "points", None)
-    if points is not None and len(points) <= 100 and getattr(trajectory, "closed", False):
+    if points is not None and len(points) <= _MOST_POINTS and getattr(trajectory, "closed", False):
         raise ModelError(
             f"the path of this {type(trajectory).__name__} is closed, and only between the way-points of an open one "
             "can a plan choose its own; give closed = false, or plan its timing alone",
             key="reference",
         )
-    if points is None or len(points) > 100:
+    if points is None or len(points) > _MOST_POINTS:
         raise ModelError(
             f"a {type(trajectory).__name__} has no way-points between which its path could be free; give a spline or "
-            "waypoints, at most 100, or plan its timing alone",
+            f"waypoints, at most {_MOST_POINTS}, or plan its timing alone",
             key="reference",
         )
     return np.array(points)
