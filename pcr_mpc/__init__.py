@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from .linearisation.linearise import linearise
     from .loop.controllers import Controller, Decision, HoldMotors
     from .loop.feasibility import check_scene
+    from .loop.hardware.camera import Camera
+    from .loop.hardware.motors import Motors
     from .loop.make_controller import make_controller
     from .loop.references.blended import Blended
     from .loop.references.on_curves import Circle, Line, Polygon, Spline, Waypoints
@@ -75,6 +77,7 @@ __all__ = [
     "MATERIALS",
     "AmbiguousPoseError",
     "Blended",
+    "Camera",
     "Circle",
     "CompilerError",
     "Controller",
@@ -100,6 +103,7 @@ __all__ = [
     "Material",
     "MeasurementError",
     "ModelError",
+    "Motors",
     "PCRError",
     "PickAndPlace",
     "Plan",
@@ -203,6 +207,8 @@ _WHERE = {
     "loop.sensors": ("Sensors",),
     "loop.simulate": ("simulate",),
     "loop.tracking": ("TrackingController",),
+    "loop.hardware.camera": ("Camera",),
+    "loop.hardware.motors": ("Motors",),
     "loop.make_controller": ("make_controller",),
     "loop.trajectory": ("Hold", "Lemniscate", "PickAndPlace", "Trajectory"),
     "plant.motion.plant": ("Plant",),
