@@ -215,6 +215,7 @@ def without_timing(rows):
     return [{name: value for name, value in row.items() if name != "timing"} for row in rows]
 
 
+@pytest.mark.slow
 def test_processes_and_a_dask_cluster_give_the_same_rows(scene, tmp_path):
     """Bit for bit: in this process, in processes of their own, and on a cluster's worker with two threads."""
     distributed = pytest.importorskip("distributed")

@@ -305,6 +305,7 @@ def test_pareto_front():
     assert pareto(x[:0], y[:0]).shape == (0, 2)
 
 
+@pytest.mark.slow
 def test_tune_writes_a_tuning_that_beats_its_start(tmp_path, monkeypatch, capsys):
     """In a process of its own: the start's observer is blind to a heavy load, so every episode of it fails."""
     for folder in (MODELS, CONTROLLERS):
