@@ -53,18 +53,18 @@ def in_earnest(few, many, check, *strategies):
 
 @pytest.fixture
 def count():
-    """Of cases, and of those that came to the assertion: few of them, and the test says nothing.
-
-    About two thirds do. Hypothesis draws constants of all modules that are loaded, too: the same 30 cases are others in
-    another company, and their share varies by a tenth.
-    """
+    """Of cases, and of those that came to the assertion: most, or the test says nothing."""
     counted = Counter()
     yield counted
-    assert counted["reached"] > 0.4 * counted["cases"] > 0, counted
+    assert counted["reached"] > 0.6 * counted["cases"] > 0, counted
 
 
 def mostly(ordinary, *others):
-    return st.integers(0, 7).flatmap(lambda k: others[k] if k < len(others) else ordinary)
+    """One in sixteen is of each other kind: so few that of 30 cases, with four such arguments, six in ten arrive.
+
+    Hypothesis draws the constants of all modules that are loaded, too: cases differ from one company to another.
+    """
+    return st.integers(0, 15).flatmap(lambda k: others[k] if k < len(others) else ordinary)
 
 
 strange = st.sampled_from([0.0, -0.0, 5e-324, 1e-300, -1e-9, 1e8, 1e200, -1e200, math.inf, -math.inf, math.nan])
@@ -137,6 +137,7 @@ def test_closed_form(count, p, q):
 
 
 @pytest.mark.slow
+@pytest.mark.longest
 @cases(5000)
 @given(tips, angles)
 def test_closed_form_over_5000_more(count, p, q):

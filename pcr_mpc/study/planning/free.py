@@ -122,17 +122,12 @@ def way_points(trajectory: Trajectory) -> np.ndarray:
         trajectory = trajectory.path
     if isinstance(trajectory, PickAndPlace):
         return np.array([trajectory.pick, trajectory.place])
-    points = getattr(trajectory, "points", None)
-    if points is not None and len(points) <= _MOST_POINTS and getattr(trajectory, "closed", False):
+    points, closed = getattr(trajectory, "points", None), getattr(trajectory, "closed", False)
+    if points is None or closed or len(points) > _MOST_POINTS:
+        kind = f"{'closed ' if closed else ''}{type(trajectory).__name__}"
         raise ModelError(
-            f"the path of this {type(trajectory).__name__} is closed, and only between the way-points of an open one "
-            "can a plan choose its own; give closed = false, or plan its timing alone",
-            key="reference",
-        )
-    if points is None or len(points) > _MOST_POINTS:
-        raise ModelError(
-            f"a {type(trajectory).__name__} has no way-points between which its path could be free; give a spline or "
-            f"waypoints, at most {_MOST_POINTS}, or plan its timing alone",
+            f"a {kind} has no way-points between which its path could be free; give a spline or waypoints that are "
+            f"open (closed = false), at most {_MOST_POINTS}, or plan its timing alone",
             key="reference",
         )
     return np.array(points)
