@@ -295,7 +295,7 @@ class _Work:
         start[:] = starts[..., : start.shape[1]]
         target[:, :2], target[:, 2:], numbers[:] = self.p[rows], self.q[rows], self._numbers
         graph()
-        records, verdict, results = (place.T.reshape(count, -1) for place in graph.outputs[-3:])
+        records, verdict, results = (place.T.reshape(count, -1) for place in graph.outputs)
         return records, verdict, results
 
     def _take(self, rows: Any, records: np.ndarray, verdict: np.ndarray, results: np.ndarray) -> None:
@@ -331,16 +331,19 @@ def _many(kind: Kind, method: RodMethod, count: int, along: bool, compiled: bool
 
 @graph_cache(maxsize=32)
 def _many_graph(kind: Kind, method: RodMethod, count: int, along: bool, compiled: bool) -> Any:
-    """(start or starts, targets, numbers) -> (last start of a path,) records, verdicts, results of ``count`` poses."""
+    """(record or starts, targets, numbers) -> records, verdicts, results of ``count`` poses."""
     warm = warm_step(kind, method, method.settling)
     warm = machine_code(warm) if compiled else warm
     target, start, numbers = (ca.MX.sym(warm.name_in(i), *warm.size_in(i)) for i in range(3))
     found = warm(target, start, numbers)
     if not along:
         return ca.Function("pose", [start, target, numbers], found).map("poses", "serial", count, [2], [])
-    step = ca.Function("pose", [start, target, numbers], [found[0][: start.numel()], *found])
+    # The whole record goes on from pose to pose, though only its first part is started from: it is there once.
+    record = ca.MX.sym("record", found[0].numel())
+    found = warm(target, record[: start.numel()], numbers)
+    step = ca.Function("pose", [record, target, numbers], found)
     if warm.is_a("SXFunction"):
         step = step.expand()
     many = step.mapaccum("poses", count, 1, {})
     targets = ca.MX.sym("targets", target.numel(), count)
-    return ca.Function("path", [start, targets, numbers], many(start, targets, ca.repmat(numbers, 1, count)))
+    return ca.Function("path", [record, targets, numbers], many(record, targets, ca.repmat(numbers, 1, count)))
