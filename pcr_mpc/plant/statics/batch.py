@@ -346,4 +346,5 @@ def _many_graph(kind: Kind, method: RodMethod, count: int, along: bool, compiled
         step = step.expand()
     many = step.mapaccum("poses", count, 1, {})
     targets = ca.MX.sym("targets", target.numel(), count)
-    return ca.Function("path", [record, targets, numbers], many(record, targets, ca.repmat(numbers, 1, count)))
+    moved: Any = many(record, targets, ca.repmat(numbers, 1, count))
+    return ca.Function("path", [record, targets, numbers], list(moved))
