@@ -4,7 +4,11 @@ Each cell runs the first seconds of the figure of eight with a robot that is not
 later than it was told, rods stiffer or softer, another control period, motors that lag, another horizon. The colour is
 the RMS error after 1 s. The loop counts as lost where a small push of the tip does not die away, or where the run ends
 early; a failure is a row like the others. The line is where the linear closed loop along the path is predicted to be
-lost (`pcr_mpc.study.margins`). Finished cells are kept in loop_stability.csv: the same command goes on where it ended.
+lost (`pcr_mpc.study.margins`).
+
+Not every cell is measured. In each line every fifth cell is; between the last of them that holds and the first that
+is lost, bisection finds the two neighbours between which the boundary is. The other cells are drawn as their nearest
+measured neighbour in the line. Finished lines are kept in loop_stability.csv: the same command goes on where it ended.
 
     python experiments/loop_stability.py --quick
     python experiments/loop_stability.py --controllers default frozen --jobs 2
@@ -16,7 +20,7 @@ import argparse
 import csv
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -25,18 +29,20 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from pcr_mpc import MarginsError, PCRError, Scene, Tuning, load_scene, load_tuning
+from pcr_mpc import PCRError, Scene, Tuning, load_scene, load_tuning
 from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import RED, plt, save_figure
-from pcr_mpc.study.margins.measured import push
-from pcr_mpc.study.margins.poses import LINEAR_LAWS, LinearLoops, scaled
+from pcr_mpc.report.tables import table
+from pcr_mpc.study.margins.measured import Pushed, PushTest
+from pcr_mpc.study.margins.poses import LINEAR_LAWS, LinearLoops, scaled, scaled_scene
 from pcr_mpc.study.margins.predicted import path_radius
 from pcr_mpc.study.parallel import finished, local_workers
 
 ROOT = Path(__file__).parent.parent
 SCENE = ROOT / "models" / "scenes" / "lemniscate.toml"
 DURATION, LATE, POSES = 2.4, 1.0, 9  # s, s
+COARSE = 5  # cells, from one that is measured in any case to the next
 MILLISECOND = 1e-3
 
 
@@ -51,81 +57,111 @@ class Map:
     y: tuple[float, ...]
 
 
-DELAYS = tuple(float(ms) for ms in range(0, 44, 4))
+LATENESS = tuple(float(ms) for ms in range(0, 64, 4))
 MAPS = (
-    Map("delay_stiffness", "untold delay [ms]", "true EI over believed [-]", DELAYS,
+    Map("delay_stiffness", "untold delay [ms]", "true EI over believed [-]", LATENESS,
         (0.5, 0.6, 0.72, 0.86, 1.0, 1.2, 1.4, 1.7, 2.0)),
-    Map("delay_period", "untold delay [ms]", "control period [ms]", DELAYS, (4.0, 5.0, 8.0, 10.0, 12.0, 15.0, 20.0)),
-    Map("lag_horizon", "lag of the motors [ms]", "horizon [periods]", DELAYS, (2.0, 3.0, 4.0, 6.0, 10.0, 15.0, 20.0)),
+    Map("delay_period", "untold delay [ms]", "control period [ms]", LATENESS, (4.0, 5.0, 8.0, 10.0, 12.0, 15.0, 20.0)),
+    Map("lag_horizon", "lag of the motors [ms]", "horizon [periods]", LATENESS, (2.0, 3.0, 4.0, 6.0, 10.0, 15.0, 20.0)),
 )  # fmt: skip
 QUICK = (Map(MAPS[0].name, MAPS[0].x_label, MAPS[0].y_label, (0.0, 8.0, 16.0), (1.0, 1.4)),)
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One run."""
+class Line:
+    """A controller with one value of the second quantity, and the values of the first that its cells have."""
 
     controller: str
     map: str
-    x: float
     y: float
+    x: tuple[float, ...]
 
 
-def tuned(cell: Cell) -> Tuning:
-    """Tuning of a cell: its controller with the cell's period or horizon."""
-    tuning = load_tuning(ROOT / "controllers" / f"{cell.controller}.toml")
-    if cell.map == "delay_period":
-        return replace(tuning, period=MILLISECOND * cell.y)
-    return replace(tuning, horizon=int(cell.y)) if cell.map == "lag_horizon" else tuning
+def tuned(line: Line) -> Tuning:
+    """Tuning of a line: its controller with the line's period or horizon."""
+    tuning = load_tuning(ROOT / "controllers" / f"{line.controller}.toml")
+    if line.map == "delay_period":
+        return replace(tuning, period=MILLISECOND * line.y)
+    if line.map == "delay_stiffness" or tuning.horizon == int(line.y):
+        return tuning
+    # Machine code of another horizon would take longer to build than it saves.
+    return replace(tuning, horizon=int(line.y), model=replace(tuning.model, compiled=False))
 
 
-def believed_scene(cell: Cell) -> Scene:
+def scene_of(tuning: Tuning) -> Scene:
     """What the controller is told."""
-    return replace(load_scene(SCENE), duration=DURATION).tuned(tuned(cell))
+    return replace(load_scene(SCENE), duration=DURATION).tuned(tuning)
 
 
-def true_scene(cell: Cell, believed: Scene) -> Scene:
+def true_scene(line: Line, x: float) -> Scene:
     """What is simulated."""
-    if cell.map == "lag_horizon":
-        return replace(believed, motors=Motors(time_constant=MILLISECOND * cell.x))
-    stiffness = cell.y if cell.map == "delay_stiffness" else 1.0
-    return replace(believed, untold_delay=MILLISECOND * cell.x, robot=scaled(believed.robot, stiffness=stiffness))
+    believed = scene_of(tuned(line))
+    if line.map == "lag_horizon":
+        return replace(believed, motors=Motors(time_constant=MILLISECOND * x))
+    moves = scaled_scene(believed, stiffness=line.y) if line.map == "delay_stiffness" else believed
+    return replace(moves, untold_delay=MILLISECOND * x)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)
+def test_of(tuning: Tuning) -> PushTest:
+    """What pushes a robot that a tuning drives: the same for all delays, lags and robots."""
+    return PushTest(scene_of(tuning))
+
+
+@lru_cache(maxsize=1)
 def loops_of(tuning: Tuning) -> LinearLoops:
-    """Linear loops of a tuning along the path: the same for all delays, lags and robots."""
-    return LinearLoops(replace(load_scene(SCENE), duration=DURATION), tuning, poses=POSES)
+    """Linear loops of a tuning along the path: likewise."""
+    return LinearLoops(scene_of(tuning), tuning, poses=POSES)
 
 
-def predicted(cell: Cell) -> float:
-    """Factor by which a small deviation grows in a period, on the mean along the path."""
-    loops = loops_of(tuned(cell))
-    robot = scaled(loops.scene.robot, stiffness=cell.y if cell.map == "delay_stiffness" else 1.0)
-    time = MILLISECOND * cell.x
-    found = [loops.at(pose, robot) for pose in loops.poses]
-    if cell.map == "lag_horizon":
-        return path_radius([replace(loop, lag=time) for loop in found])
-    return path_radius([loop.later(time) for loop in found])
-
-
-def run_cell(cell: Cell) -> dict[str, Any]:
-    """Row of a cell."""
-    row: dict[str, Any] = {"controller": cell.controller, "map": cell.map, "x": cell.x, "y": cell.y}
+def predicted(line: Line) -> list[float]:
+    """Factors by which a small deviation grows in a period, on the mean along the path: one for each cell."""
     try:
-        believed = believed_scene(cell)
+        loops = loops_of(tuned(line))
+        robot = scaled(loops.scene.robot, stiffness=line.y if line.map == "delay_stiffness" else 1.0)
+        found = [loops.at(pose, robot) for pose in loops.poses]
+    except (PCRError, ValueError):  # measured it can be
+        return [math.nan] * len(line.x)
+    if line.map == "lag_horizon":
+        return [path_radius([replace(loop, lag=MILLISECOND * x) for loop in found]) for x in line.x]
+    return [path_radius([loop.later(MILLISECOND * x) for loop in found]) for x in line.x]
+
+
+def chosen(holds: Callable[[int], bool], count: int) -> None:
+    """Ask of some of so many cells in a line whether the loop holds: coarsely all along, and to either side of where it
+    is lost."""
+    coarse = sorted({*range(0, count, COARSE), count - 1})
+    answers = [holds(i) for i in coarse]
+    if all(answers) or not answers[0]:
+        return
+    first = answers.index(False)
+    low, high = coarse[first - 1], coarse[first]
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+
+
+def run_line(line: Line) -> list[dict[str, Any]]:
+    """Rows of a line's cells; those that were not measured have no figures but the predicted one."""
+    rows: list[dict[str, Any]] = [
+        {"controller": line.controller, "map": line.map, "x": x, "y": line.y, "predicted_radius": radius,
+         "rms_mm": math.nan, "stable": math.nan, "failure": ""}
+        for x, radius in zip(line.x, predicted(line), strict=True)
+    ]  # fmt: skip
+
+    def holds(i: int) -> bool:
         try:
-            row["predicted_radius"] = predicted(cell)
-        except MarginsError:  # measured it can be
-            row["predicted_radius"] = math.nan
-        found = push(believed, true_scene(cell, believed))
-    except (PCRError, ValueError) as error:
-        return {**row, "rms_mm": math.nan, "stable": 0, "failure": f"{type(error).__name__}: {error}"}
-    rms = math.nan
-    if found.run is not None and not found.failure:
-        late = 1e3 * found.run.error[found.run.t >= LATE]
-        rms = float(np.sqrt(np.mean(late**2)))
-    return {**row, "rms_mm": rms, "stable": int(found.dies_away), "failure": found.failure}
+            found = test_of(tuned(line))(true_scene(line, line.x[i]))
+        except (PCRError, ValueError) as error:
+            found = Pushed(False, None, f"{type(error).__name__}: {error}")
+        rows[i] |= {"stable": int(found.dies_away), "failure": found.failure}
+        if found.run is not None and not found.failure:
+            late = 1e3 * found.run.error[found.run.t >= LATE]
+            rows[i]["rms_mm"] = float(np.sqrt(np.mean(late**2)))
+        return found.dies_away
+
+    chosen(holds, len(line.x))
+    return rows
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
@@ -139,28 +175,41 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def boundaries(rows: Sequence[dict[str, Any]], study: Map) -> list[tuple[int, int]]:
-    """For each row of a map that has a boundary, how many cells are stable: measured, and predicted."""
+    """For each line of a map that has a boundary, how many cells are stable: measured, and predicted.
+
+    A line of which nothing holds, measured and predicted, has none, nor has one that holds all along.
+    """
     found = []
     by_place = {(row["x"], row["y"]): row for row in rows}
     for y in study.y:
         line = [by_place[x, y] for x in study.x if (x, y) in by_place]
         if len(line) < len(study.x) or any(math.isnan(row["predicted_radius"]) for row in line):
             continue
-        measured = next((i for i, row in enumerate(line) if not row["stable"]), len(line))
+        measured = next((i for i, row in enumerate(line) if row["stable"] == 0.0), len(line))
         said = next((i for i, row in enumerate(line) if not row["predicted_radius"] < 1.0), len(line))
-        if min(measured, said) < len(line):
+        if (measured, said) not in ((0, 0), (len(line), len(line))):
             found.append((measured, said))
     return found
 
 
-def agreement(rows: Sequence[dict[str, Any]], maps: Sequence[Map]) -> tuple[int, int]:
-    """Cells along the measured boundaries, and those of them that have the predicted one within one cell."""
-    pairs = []
+def filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Values of a line, where one is not known that of the nearest cell that is."""
+    places = np.flatnonzero(known)
+    if not len(places):
+        return values
+    return np.asarray(values[places[np.abs(np.arange(len(values))[:, None] - places).argmin(axis=1)]])
+
+
+def agreement(rows: Sequence[dict[str, Any]], maps: Sequence[Map]) -> dict[tuple[str, str], tuple[int, int]]:
+    """For each map and controller: cells along the measured boundary, and those that have the predicted one within one
+    cell."""
+    found = {}
     for study in maps:
         mine = [row for row in rows if row["map"] == study.name]
         for controller in dict.fromkeys(row["controller"] for row in mine):
-            pairs += boundaries([row for row in mine if row["controller"] == controller], study)
-    return len(pairs), sum(abs(measured - said) <= 1 for measured, said in pairs)
+            pairs = boundaries([row for row in mine if row["controller"] == controller], study)
+            found[study.name, controller] = len(pairs), sum(abs(measured - said) <= 1 for measured, said in pairs)
+    return found
 
 
 def plot(rows: Sequence[dict[str, Any]], study: Map, path: Path) -> None:
@@ -180,12 +229,16 @@ def plot(rows: Sequence[dict[str, Any]], study: Map, path: Path) -> None:
         for row in rows:
             if row["controller"] == names[place] and row["x"] in study.x and row["y"] in study.y:
                 at = study.y.index(row["y"]), study.x.index(row["x"])
-                values[at], radius[at], lost[at] = row["rms_mm"], row["predicted_radius"], not row["stable"]
+                values[at], radius[at], lost[at] = row["rms_mm"], row["predicted_radius"], 1.0 - row["stable"]
+        known = ~np.isnan(lost)
+        values = np.stack([filled(*line) for line in zip(values, known, strict=True)])
         axis.set_facecolor("#dddddd")
         shades = axis.pcolormesh(np.clip(values, 1e-3, 100.0), norm=LogNorm(1e-3, 100.0), cmap="viridis")
         y, x = np.nonzero(lost == 1.0)
         axis.plot(x + 0.5, y + 0.5, "x", color="white", ms=4, mew=1.2)
         axis.plot(x + 0.5, y + 0.5, "x", color="black", ms=4, mew=0.6)
+        y, x = np.nonzero(lost == 0.0)
+        axis.plot(x + 0.5, y + 0.5, "o", color="white", ms=1.5)
         for j in range(len(study.y)):  # the edge before the first cell that is predicted to be lost
             if np.isnan(radius[j]).any():
                 continue
@@ -200,8 +253,11 @@ def plot(rows: Sequence[dict[str, Any]], study: Map, path: Path) -> None:
         axis.set_ylabel(study.y_label)
     if shades is not None:
         figure.colorbar(shades, ax=axes, label="RMS error after 1 s [mm]")
-    figure.suptitle("line: predicted to be lost beyond\ncross: a small push does not die away\n"
-                    "grey: ended early, or not run", fontsize=10)  # fmt: skip
+    figure.suptitle(
+        "line: predicted to be lost beyond\ndot: measured, holds; cross: measured, a push does not die away\n"
+        "the others as their nearest measured neighbour in the line; grey: ended early",
+        fontsize=10,
+    )
     save_figure(figure, path)
 
 
@@ -212,8 +268,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--maps", nargs="+", choices=[study.name for study in MAPS], help="default: all")
     parser.add_argument("--jobs", type=int, help="processes (default: one a core)")
     parser.add_argument("--out", type=Path, default=Path("results") / "loop_stability", help="folder for the results")
-    parser.add_argument("--fresh", action="store_true", help="discard the finished cells in that folder first")
-    parser.add_argument("--quick", action="store_true", help="six cells of one controller")
+    parser.add_argument("--fresh", action="store_true", help="discard the finished lines in that folder first")
+    parser.add_argument("--quick", action="store_true", help="two lines of one controller")
     options = parser.parse_args(arguments)
     try:
         return _study(options)
@@ -231,40 +287,44 @@ def _study(options: argparse.Namespace) -> int:
     for name in names:
         if tunings[name].law not in LINEAR_LAWS:
             print(f"{name}: law {tunings[name].law} has no linear loop, and is left out", file=sys.stderr)
-    cells = [
-        Cell(name, study.name, x, y)
-        for name in names
+    lines = [
+        Line(name, study.name, y, study.x)
         for study in maps
+        for name in names
         for y in study.y
-        for x in study.x
         if tunings[name].law in LINEAR_LAWS and (study.name != "lag_horizon" or tunings[name].law == "linear_mpc")
     ]
     path = options.out / "loop_stability.csv"
     rows = [] if options.fresh else read_rows(path)
-    done = {Cell(row["controller"], row["map"], row["x"], row["y"]) for row in rows}
-    left = [cell for cell in cells if cell not in done]
+    done = {(row["controller"], row["map"], row["x"], row["y"]) for row in rows}
+    left = [line for line in lines if any((line.controller, line.map, x, line.y) not in done for x in line.x)]
+    again = {(line.controller, line.map, line.y) for line in left}
+    rows = [row for row in rows if (row["controller"], row["map"], row["y"]) not in again]
     try:
         with local_workers(options.jobs) as executor:
-            for count, (_, row) in enumerate(
-                finished(executor, run_cell, left, desc="loop stability", unit="cell", before=len(cells) - len(left))
-            ):
-                rows.append(row)
-                if count % 20 == 19:
-                    write_rows(path, rows)
+            for _, of_line in finished(executor, run_line, left, desc="loop stability", unit="line",
+                                       before=len(lines) - len(left)):  # fmt: skip
+                rows += of_line
+                write_rows(path, rows)
     finally:
         if rows:
             write_rows(path, rows)
-    order = {cell: i for i, cell in enumerate(cells)}
-    mine = [row for row in rows if Cell(row["controller"], row["map"], row["x"], row["y"]) in order]
+    wanted = {(line.controller, line.map, line.y) for line in lines}
+    mine = [row for row in rows if (row["controller"], row["map"], row["y"]) in wanted]
     for study in maps:
         of_map = [row for row in mine if row["map"] == study.name]
         if of_map:
             plot(of_map, study, options.out / f"{study.name}.png")
-    along, near = agreement(mine, maps)
+    counts = agreement(mine, maps)
+    print(table(("map", "controller", "lines with a boundary", "within one cell"),
+                [(*key, str(along), str(near)) for key, (along, near) in counts.items() if along]))  # fmt: skip
+    along, near = (sum(each) for each in zip(*counts.values(), strict=True)) if counts else (0, 0)
     share = f"{100 * near / along:.0f} %" if along else "no boundary"
-    failed = sum(bool(row["failure"]) for row in mine)
-    print(f"{len(mine)} cells, {failed} ended early; predicted boundary within one cell of the measured one in {near} "
-          f"of {along} rows ({share}); written to {options.out}")  # fmt: skip
+    measured = [row for row in mine if not math.isnan(row["stable"])]
+    failed = sum(bool(row["failure"]) for row in measured)
+    print(f"{len(mine)} cells, {len(measured)} of them measured, of which {failed} ended early")
+    print(f"predicted boundary within one cell of the measured one in {near} of {along} lines ({share})")
+    print(f"written to {options.out}")
     return 0
 
 

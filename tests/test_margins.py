@@ -11,8 +11,8 @@ from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.trajectory import Hold
 from pcr_mpc.study.margins.linear_loop import LinearLoop
-from pcr_mpc.study.margins.measured import held_scene, measure_delay_margin, push_dies_away
-from pcr_mpc.study.margins.poses import LinearLoops, scaled
+from pcr_mpc.study.margins.measured import PushTest, held_scene, measure_delay_margin, push_dies_away
+from pcr_mpc.study.margins.poses import LinearLoops, scaled, scaled_scene
 from pcr_mpc.study.margins.predicted import _classical, delay_margin, predict_delay_margin
 
 from .conftest import CONTROLLERS, MODELS
@@ -162,6 +162,25 @@ def test_a_push_dies_away_below_the_margin_and_grows_above(lemniscate):
     here = held_scene(lemniscate.tuned(tuning), margin.p)
     assert push_dies_away(here, replace(here, untold_delay=0.93 * margin.value))
     assert not push_dies_away(here, replace(here, untold_delay=1.1 * margin.value))
+
+
+def test_one_controller_pushes_as_new_ones_do(lemniscate):
+    """What was made for one push, and what a lost run has left in it, changes no bit of the next."""
+    told = replace(lemniscate, duration=0.4).tuned(load_tuning(CONTROLLERS / "frozen.toml"))
+    lost, borne = (replace(told, untold_delay=time) for time in (0.03, 0.005))
+    test = PushTest(told)
+    assert not test(lost).dies_away
+    again, new = test(borne), PushTest(told)(borne)
+    assert again.dies_away
+    assert new.dies_away
+    assert np.array_equal(again.run.x, new.run.x)
+
+
+def test_a_stiffer_robot_stands_where_the_softer_one_does(lemniscate):
+    """Holding takes as much more torque, which scene and motors then have."""
+    assert scaled_scene(lemniscate, stiffness=2.5).start().motor_torque == pytest.approx(
+        2.5 * lemniscate.start().motor_torque
+    )
 
 
 @pytest.mark.slow

@@ -12,18 +12,24 @@ from tqdm import tqdm
 
 from ... import interrupt
 from ...control.tuning import Tuning
-from ...errors import MarginsError, PCRError, SimulationError
+from ...errors import MarginsError, PCRError, SimulationError, UnstableError
+from ...loop.controllers import Decision
+from ...loop.feed_forward import InverseDynamics
 from ...loop.make_controller import make_controller
 from ...loop.run import Run
 from ...loop.scene import Scene
 from ...loop.simulate import simulate
+from ...loop.tracking import TrackingController
 from ...loop.trajectory import Hold
+from ...plant.statics.equilibrium import Equilibrium
 from .poses import LINEAR_LAWS
 
 _PERIODS = 300  # that a pose is held
 _PUSH = 1e-5  # of the shortest rod, by which the tip would move in a period
 _FLOOR = 1e-3  # of the largest deviation: below, what is left of a push is the solver's tolerance
 _FAR = 1e-3  # of the shortest rod: no such way of a small push has died away
+_ASTRAY, _DIVERGED = 0.25, 1e-2  # of it: a run so far from its reference, or from the one without a push, is lost
+_GONE = "from where it should be"
 _LOST = 30.0  # times the largest deviation of the first third
 _TOLERANCE = 0.01  # of a margin
 _STEP, _FURTHEST = 1.15, 6.0  # from one try to the next, and from the guess at most
@@ -58,7 +64,7 @@ def held_scene(scene: Scene, p: tuple[float, float]) -> Scene:
 
 @dataclass(frozen=True, eq=False)
 class Pushed:
-    """What became of a small push.
+    """What became of a small push (see `PushTest`).
 
     Attributes
     ----------
@@ -74,40 +80,82 @@ class Pushed:
     failure: str = ""
 
 
-def push(believed: Scene, true: Scene) -> Pushed:
-    """Push the tip a little at the start of the nonlinear simulation, and see whether that dies away.
+class PushTest:
+    """Pushes of robots that one controller drives: what it is made of is made once.
 
-    Two runs differ by the push alone. It dies away if less of their difference is left in the last third of the time
-    than in the second, or next to nothing.
+    Two runs of the nonlinear simulation differ by a small push of the tip at the start alone. The push dies away if
+    less of their difference is left in the last third of the time than in the second, or next to nothing. A run ends at
+    once where it is lost beyond doubt.
 
     Parameters
     ----------
     believed : Scene
         Of which the controller is made, with its tuning.
-    true : Scene
-        That is simulated.
     """
-    speed = _PUSH * float(true.robot.lengths.min()) / true.period
-    quiet = replace(true, tip_noise=0.0, angle_step=0.0, deadline=math.inf)
-    pushed = replace(quiet, start_velocity=(quiet.start_velocity[0] + speed, quiet.start_velocity[1] + speed))
-    runs: list[Run] = []
-    for each in (quiet, pushed):
+
+    def __init__(self, believed: Scene) -> None:
+        # Encoder steps are left out of the runs, and no estimate is to rest between two of them.
+        self._believed = replace(believed, angle_step=0.0)
+        self._controller = self._made()
+
+    def _made(self, reference: InverseDynamics | None = None) -> TrackingController:
+        controller = make_controller(self._believed, reference=reference)
+        assert isinstance(controller, TrackingController)
+        return controller
+
+    def __call__(self, true: Scene) -> Pushed:
+        """Push the robot of a scene."""
+        shortest = float(true.robot.lengths.min())
+        quiet = replace(true, tip_noise=0.0, angle_step=0.0, deadline=math.inf)
+        speed, (x, y) = _PUSH * shortest / true.period, quiet.start_velocity
+        assert quiet.trajectory is not None
+        run, failure = self._run(quiet, quiet.trajectory(quiet.period * np.arange(quiet.n_periods))[:, 0],
+                                 _ASTRAY * shortest)  # fmt: skip
+        if run is None or failure:
+            return Pushed(False, run, failure)
+        pushed = replace(quiet, start_velocity=(x + speed, y + speed))
+        other, failure = self._run(pushed, run.measured[:, :2], _DIVERGED * shortest)
+        if other is None or failure:
+            return Pushed(False, run, "" if failure.endswith(_GONE) else failure)
+        deviations = np.linalg.norm(run.x[:, :2] - other.x[:, :2], axis=1)
+        first, second, last = (float(np.sqrt(np.mean(part**2))) for part in np.array_split(deviations, 3))
+        largest = float(deviations[: len(deviations) // 3].max())
+        grown = last >= _LOST * first or last >= _FAR * shortest
+        return Pushed(not grown and (last < second or last < _FLOOR * largest), run)
+
+    def _run(self, scene: Scene, tips: np.ndarray, furthest: float) -> tuple[Run | None, str]:
+        """Run until the measured tip is further than that from ``tips``, one a period [m]; why it ended early."""
+        watched = _Watched(self._controller, tips, furthest)
         try:
-            runs.append(simulate(each, each.make_plant(), make_controller(believed)))
+            return simulate(scene, scene.make_plant(), watched), ""
         except PCRError as error:  # a robot that is lost, or cannot stand at all
             interrupt.pass_on(error)
-            ended = runs[0] if runs else error.run if isinstance(error, SimulationError) else None
-            return Pushed(False, ended, str(error))
-    tips = np.linalg.norm(runs[0].x[:, :2] - runs[1].x[:, :2], axis=1)
-    first, second, last = (float(np.sqrt(np.mean(part**2))) for part in np.array_split(tips, 3))
-    largest = float(tips[: len(tips) // 3].max())
-    grown = last >= _LOST * first or last >= _FAR * float(true.robot.lengths.min())
-    return Pushed(not grown and (last < second or last < _FLOOR * largest), runs[0])
+            return error.run if isinstance(error, SimulationError) else None, str(error)
+        finally:
+            if watched.started:
+                self._controller = self._made(self._controller.reference)
+
+
+class _Watched:
+    """A controller that ends the run where the tip is too far from where it is expected."""
+
+    def __init__(self, controller: TrackingController, tips: np.ndarray, furthest: float) -> None:
+        self.name, self._controller, self._tips, self._furthest = controller.name, controller, tips, furthest
+        self.started = False
+
+    def start(self, pose: Equilibrium) -> None:
+        self._controller.start(pose)
+        self.started = True
+
+    def step(self, k: int, x: np.ndarray) -> Decision:
+        if float(np.hypot(*(x[:2] - self._tips[k]))) > self._furthest:  # not a number: no picture
+            raise UnstableError(f"the tip is more than {1e3 * self._furthest:.3g} mm {_GONE}")
+        return self._controller.step(k, x)
 
 
 def push_dies_away(believed: Scene, true: Scene) -> bool:
-    """Whether a small push dies away (see `push`)."""
-    return push(believed, true).dies_away
+    """Whether a small push dies away (see `PushTest`)."""
+    return PushTest(believed)(true).dies_away
 
 
 def measure_delay_margin(
@@ -144,8 +192,10 @@ def measure_delay_margin(
     scene = _tuned(scene, tuning)
     here = scene if p is None else held_scene(scene, p)
 
+    test = PushTest(here)
+
     def holds(time: float) -> bool:
-        return push_dies_away(here, replace(here, untold_delay=here.untold_delay + time))
+        return test(replace(here, untold_delay=here.untold_delay + time)).dies_away
 
     about = guess if guess and math.isfinite(guess) else scene.period
     return _measured(holds, 0.0, about, f"{'along the path' if p is None else 'held'}: delay", progress)
@@ -168,7 +218,8 @@ def measure_largest(
     """
     here = held_scene(scene, p)
     about = guess if math.isfinite(guess) and guess > nominal else 2.0 * nominal or scene.period
-    return _measured(lambda value: push_dies_away(here, change(here, value)), nominal, about, desc, progress)
+    test = PushTest(here)
+    return _measured(lambda value: test(change(here, value)).dies_away, nominal, about, desc, progress)
 
 
 def _measured(holds: Callable[[float], bool], nominal: float, guess: float, desc: str, progress: bool) -> Measured:

@@ -181,3 +181,11 @@ def scaled(robot: Robot, *, stiffness: float = 1.0, mass: float = 1.0) -> Robot:
     rods = tuple(replace(rod, bending_stiffness=stiffness * rod.bending_stiffness) for rod in robot.rods)
     return replace(robot, rods=rods, tip_mass=mass * robot.tip_mass,
                    torque_limit=stiffness * robot.torque_limit)  # fmt: skip
+
+
+def scaled_scene(scene: Scene, *, stiffness: float = 1.0, mass: float = 1.0) -> Scene:
+    """Return a scene of such a robot: what its poses may take in torque is scaled too."""
+    limits = scene.pose_limits
+    if limits.torque is not None:
+        limits = replace(limits, torque=stiffness * limits.torque)
+    return replace(scene, robot=scaled(scene.robot, stiffness=stiffness, mass=mass), pose_limits=limits)

@@ -11,7 +11,7 @@ from ...control.tuning import Tuning
 from ...loop.hardware.motors import IDEAL
 from ...loop.scene import Scene
 from .measured import Measured, measure_delay_margin, measure_largest
-from .poses import scaled
+from .poses import scaled_scene
 from .predicted import Margins, predict_margins
 
 
@@ -66,8 +66,8 @@ def compare_margins(
         rows["delay_margin_ms"] |= {"measured": _plain(held, 1e3), "measured_along_path": _plain(along, 1e3)}
         own = told.motors or IDEAL
         changes: dict[str, tuple[Callable[[Scene, float], Scene], float, float]] = {
-            "stiffness_factor": (lambda s, v: replace(s, robot=scaled(s.robot, stiffness=v)), 1.0, 1.0),
-            "mass_factor": (lambda s, v: replace(s, robot=scaled(s.robot, mass=v)), 1.0, 1.0),
+            "stiffness_factor": (lambda s, v: scaled_scene(s, stiffness=v), 1.0, 1.0),
+            "mass_factor": (lambda s, v: scaled_scene(s, mass=v), 1.0, 1.0),
             "motor_lag_ms": (lambda s, v: replace(s, motors=replace(own, time_constant=v)), own.time_constant, 1e3),
         }
         for name, (change, nominal, unit) in changes.items():
