@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from pcr_mpc import Robot, Scene, SimulationError, Tuning, load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.errors import PCRError
-from pcr_mpc.loop.controllers import Controller
+from pcr_mpc.loop.parts.controllers import Controller
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt
 from pcr_mpc.report.tables import table
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from pcr_mpc import Equilibrium, InfeasibleError, Plant, Robot, Scene, Tuning, linearise
 from pcr_mpc.control.mpc import terminal_weight
-from pcr_mpc.loop.controllers import Decision
-from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.parts import motor_limits
+from pcr_mpc.loop.demand.feed_forward import feed_forward
+from pcr_mpc.loop.parts.assembled import motor_limits
+from pcr_mpc.loop.parts.controllers import Decision
 from pcr_mpc.plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 
 with warnings.catch_warnings():

@@ -16,7 +16,7 @@ import numpy as np
 
 from pcr_mpc import Plant, Run, SimulationError, assess_stability, load_scene, make_controller, simulate
 from pcr_mpc.linearisation.pose_limits import PoseLimits
-from pcr_mpc.loop.trajectory import PickAndPlace
+from pcr_mpc.loop.references.trajectory import PickAndPlace
 from pcr_mpc.report.style import BLUE, GREY, RED, plt
 
 SCENE = Path(__file__).parent.parent / "models" / "scenes" / "lemniscate.toml"

@@ -25,8 +25,8 @@ from pcr_mpc import Equilibrium, Plant, Robot, Scene, inverse_statics, load_robo
 from pcr_mpc.buffered import BufferedFunction
 from pcr_mpc.compiled import has_compiler
 from pcr_mpc.control.tuning import Tuning, load_tuning
-from pcr_mpc.loop.make_controller import make_controller
-from pcr_mpc.loop.simulate import simulate
+from pcr_mpc.loop.controller.make_controller import make_controller
+from pcr_mpc.loop.run.simulate import simulate
 from pcr_mpc.plant.motion.step_graph import step_function
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, plt

@@ -48,10 +48,10 @@ from pcr_mpc import (
     make_controller,
     simulate,
 )
-from pcr_mpc.loop.controllers import Controller, Decision
-from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.parts import motor_limits
-from pcr_mpc.loop.trajectory import Lemniscate
+from pcr_mpc.loop.demand.feed_forward import feed_forward
+from pcr_mpc.loop.parts.assembled import motor_limits
+from pcr_mpc.loop.parts.controllers import Controller, Decision
+from pcr_mpc.loop.references.trajectory import Lemniscate
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREY, RED, plt
 

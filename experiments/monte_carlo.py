@@ -41,8 +41,8 @@ from pcr_mpc import (
     load_tuning,
     load_uncertainty,
 )
-from pcr_mpc.cli_parser import tuning_or_class
-from pcr_mpc.loop.own_controller import OwnController
+from pcr_mpc.cli.parser import tuning_or_class
+from pcr_mpc.loop.controller.own_controller import OwnController
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.plots import animate_run, plot_run
 from pcr_mpc.report.style import BLUE, GREY, ORANGE, RED, plt

@@ -36,7 +36,7 @@ from pcr_mpc import (
     rollout,
     sensitivities,
 )
-from pcr_mpc.loop.feed_forward import feed_forward
+from pcr_mpc.loop.demand.feed_forward import feed_forward
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, plt, save_figure
 from pcr_mpc.report.tables import table

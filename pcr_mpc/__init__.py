@@ -30,22 +30,22 @@ if TYPE_CHECKING:
     )
     from .linearisation.linear_model import LinearModel
     from .linearisation.linearise import linearise
-    from .loop.controllers import Controller, Decision, HoldMotors
-    from .loop.feasibility import check_scene
+    from .loop.controller.make_controller import make_controller
+    from .loop.controller.tracking import TrackingController
+    from .loop.demand.feasibility import check_scene
     from .loop.hardware.camera import Camera
     from .loop.hardware.motors import Motors
-    from .loop.make_controller import make_controller
+    from .loop.parts.controllers import Controller, Decision, HoldMotors
     from .loop.references.blended import Blended
     from .loop.references.on_curves import Circle, Line, Polygon, Spline, Waypoints
     from .loop.references.path_file import load_path
     from .loop.references.tabulated import Tabulated
-    from .loop.run import Run, load_run
-    from .loop.scene import Scene
-    from .loop.scene_file import load_scene
-    from .loop.sensors import Sensors
-    from .loop.simulate import simulate
-    from .loop.tracking import TrackingController
-    from .loop.trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
+    from .loop.references.trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
+    from .loop.run.run import Run, load_run
+    from .loop.run.simulate import simulate
+    from .loop.scene.file import load_scene
+    from .loop.scene.scene import Scene
+    from .loop.scene.sensors import Sensors
     from .plant.materials import MATERIALS, Material, Section
     from .plant.motion.plant import Plant
     from .plant.motion.rollout import Rollout, rollout
@@ -195,22 +195,22 @@ _WHERE = {
     ),
     "linearisation.linear_model": ("LinearModel",),
     "linearisation.linearise": ("linearise",),
-    "loop.controllers": ("Controller", "Decision", "HoldMotors"),
-    "loop.feasibility": ("check_scene",),
+    "loop.parts.controllers": ("Controller", "Decision", "HoldMotors"),
+    "loop.demand.feasibility": ("check_scene",),
     "loop.references.blended": ("Blended",),
     "loop.references.on_curves": ("Circle", "Line", "Polygon", "Spline", "Waypoints"),
     "loop.references.path_file": ("load_path",),
     "loop.references.tabulated": ("Tabulated",),
-    "loop.run": ("Run", "load_run"),
-    "loop.scene": ("Scene",),
-    "loop.scene_file": ("load_scene",),
-    "loop.sensors": ("Sensors",),
-    "loop.simulate": ("simulate",),
-    "loop.tracking": ("TrackingController",),
+    "loop.run.run": ("Run", "load_run"),
+    "loop.scene.scene": ("Scene",),
+    "loop.scene.file": ("load_scene",),
+    "loop.scene.sensors": ("Sensors",),
+    "loop.run.simulate": ("simulate",),
+    "loop.controller.tracking": ("TrackingController",),
     "loop.hardware.camera": ("Camera",),
     "loop.hardware.motors": ("Motors",),
-    "loop.make_controller": ("make_controller",),
-    "loop.trajectory": ("Hold", "Lemniscate", "PickAndPlace", "Trajectory"),
+    "loop.controller.make_controller": ("make_controller",),
+    "loop.references.trajectory": ("Hold", "Lemniscate", "PickAndPlace", "Trajectory"),
     "plant.motion.plant": ("Plant",),
     "plant.statics.equilibria": ("Equilibria",),
     "plant.statics.equilibrium": ("Equilibrium",),

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pcr_mpc.loop.trajectory import Lemniscate
+from pcr_mpc.loop.references.trajectory import Lemniscate
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from pcr_mpc import load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.codegen.scope import check_scope
 from pcr_mpc.control.observer import DisturbanceObserver, ObserverTuning
 from pcr_mpc.errors import GenerationError, ModelError
-from pcr_mpc.loop.adaptation import Adaptation, AdaptedTrack
-from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.parts import resting_model
-from pcr_mpc.loop.settings import Payload
-from pcr_mpc.loop.track import Track
+from pcr_mpc.loop.controller.adaptation import Adaptation, AdaptedTrack
+from pcr_mpc.loop.demand.feed_forward import feed_forward
+from pcr_mpc.loop.demand.track import Track
+from pcr_mpc.loop.parts.assembled import resting_model
+from pcr_mpc.loop.scene.settings import Payload
 from pcr_mpc.study.tuning_file import write_tuning
 
 from .conftest import CONTROLLERS, MODELS

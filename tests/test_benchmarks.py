@@ -57,7 +57,7 @@ def run(monkeypatch, kept, measurements, *options):
     return code
 
 
-def test_a_ratio_must_be_worse_twice_to_fail(tmp_path, monkeypatch, capsys):
+def test_a_ratio_must_be_worse_each_time_to_fail(tmp_path, monkeypatch, capsys):
     kept = tmp_path / "kept.json"
     assert run(monkeypatch, kept, [{"a": 10.0}]) == 0
     assert "is not there" in capsys.readouterr().out
@@ -66,7 +66,11 @@ def test_a_ratio_must_be_worse_twice_to_fail(tmp_path, monkeypatch, capsys):
     assert {"commit", "machine", "versions"} <= json.loads(kept.read_text()).keys()
     assert run(monkeypatch, kept, [{"a": 6.0, "b": 0.6}]) == 0
     assert run(monkeypatch, kept, [{"a": 4.0, "b": 1.0}, {"a": 9.0, "b": 0.1}]) == 0
-    assert run(monkeypatch, kept, [{"a": 4.0, "b": 1.0}, {"a": 3.0, "b": 1.0}]) == 1
+    assert (
+        run(monkeypatch, kept, [{"a": 4.0, "b": 1.0}, {"a": 3.0, "b": 0.1}, {"a": 4.0, "b": 1.0}, {"a": 5.0, "b": 0.1}])
+        == 0
+    )
+    assert run(monkeypatch, kept, [{"a": 4.0, "b": 1.0}] + 3 * [{"a": 3.0, "b": 1.0}]) == 1
     assert json.loads(kept.read_text())["ratios"] == {"a": 10.0, "b": 1.0}
 
 

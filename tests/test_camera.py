@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pcr_mpc import LinearModel, ModelError, load_scene, load_tuning, make_controller, simulate
-from pcr_mpc.loop.controllers import Replay
 from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.hardware.past import PastEstimates
-from pcr_mpc.loop.record import from_text, to_text
+from pcr_mpc.loop.parts.controllers import Replay
+from pcr_mpc.loop.run.record import from_text, to_text
 
 from .conftest import CONTROLLERS, MODELS
 from .test_gate import Spoilt, apart_mm, at

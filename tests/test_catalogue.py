@@ -122,7 +122,7 @@ def test_track_takes_names_of_scene_and_tuning(tmp_path, capsys, monkeypatch):
         seen.append(scene)
         raise PCRError("enough")
 
-    monkeypatch.setattr("pcr_mpc.cli_track.simulate", simulate)
+    monkeypatch.setattr("pcr_mpc.cli.track.simulate", simulate)
     assert main(["track", "hold_slow", "--controller", "lqr"]) == 1
     assert "enough" in capsys.readouterr().err
     assert seen == [replace(load_scene(MODELS / "scenes/hold_slow.toml"), tuning=load_tuning(CONTROLLERS / "lqr.toml"))]
@@ -138,12 +138,12 @@ def test_what_comes_with_the_package_is_left_as_it_came(capsys):
 def test_a_tuning_of_a_named_scene_is_written_here(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     wanted = []
-    monkeypatch.setattr("pcr_mpc.cli_study.require_free", lambda path, force: wanted.append(str(path)))
+    monkeypatch.setattr("pcr_mpc.cli.study.require_free", lambda path, force: wanted.append(str(path)))
 
     def refuse(*_, **__):
         raise PCRError("enough")
 
-    monkeypatch.setattr("pcr_mpc.cli_study.require_folder", refuse)
+    monkeypatch.setattr("pcr_mpc.cli.study.require_folder", refuse)
     assert main(["tune", "pick_and_place"]) == 1
     assert main(["tune", str(shipped("pick_and_place"))]) == 1
     assert wanted == ["pick_and_place.toml", str(CONTROLLERS / "pick_and_place.toml")]

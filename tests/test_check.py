@@ -13,7 +13,7 @@ from pcr_mpc.cli import main
 from pcr_mpc.design.examination import examine
 from pcr_mpc.design.reach import tips_within
 from pcr_mpc.design.remarks import about_steps, unidentifiable
-from pcr_mpc.loop.trajectory import Hold
+from pcr_mpc.loop.references.trajectory import Hold
 from pcr_mpc.report.check_picture import plot_check
 from pcr_mpc.report.check_tables import check_table
 

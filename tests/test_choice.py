@@ -9,7 +9,7 @@ import pytest
 
 from pcr_mpc import ConvergenceError, forward_statics, inverse_statics, load_scene
 from pcr_mpc.errors import NoRungError
-from pcr_mpc.loop.settings import Need, PlantSettings
+from pcr_mpc.loop.scene.settings import Need, PlantSettings
 from pcr_mpc.report.choice_tables import choice_record, choice_table
 from pcr_mpc.study.choice import Bench, Measured, apart, choose, lowest
 from pcr_mpc.study.estimates import Estimates

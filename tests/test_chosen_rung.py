@@ -9,7 +9,7 @@ import pytest
 
 from pcr_mpc import ModelError, load_scene
 from pcr_mpc.cli import main
-from pcr_mpc.loop.finding import digest, verified
+from pcr_mpc.loop.run.finding import digest, verified
 from pcr_mpc.study.choice import choose
 from pcr_mpc.study.chosen_rung import write_rung
 from pcr_mpc.study.rungs import ladders, levels
@@ -57,7 +57,7 @@ def file(original):
 
 
 def test_the_chosen_rung_is_written_and_known_again(file, choice, capsys, monkeypatch):
-    monkeypatch.setattr("pcr_mpc.cli_study.choose", lambda scene, *, progress: choice)
+    monkeypatch.setattr("pcr_mpc.cli.study.choose", lambda scene, *, progress: choice)
     assert not verified(load_scene(file))
     assert main(["choose", str(file), "--write"]) == 0
     assert "chosen: inertia condensed" in capsys.readouterr().out

@@ -17,8 +17,8 @@ from pcr_mpc.codegen.scope import check_scope
 from pcr_mpc.codegen.subject import Subject
 from pcr_mpc.codegen.tables import parameters
 from pcr_mpc.errors import GenerationError, PCRError
-from pcr_mpc.loop.make_controller import make_controller
-from pcr_mpc.loop.scene_file import load_scene
+from pcr_mpc.loop.controller.make_controller import make_controller
+from pcr_mpc.loop.scene.file import load_scene
 
 from .conftest import ROOT
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from pcr_mpc import PCRError, cli_statics, load_scene
+from pcr_mpc import PCRError, load_scene
 from pcr_mpc.cli import main
+from pcr_mpc.cli import statics as cli_statics
 from pcr_mpc.study import tuning_space
 from pcr_mpc.study.episodes import Spread
 
@@ -73,7 +74,7 @@ def test_tune_hands_on_its_options(tmp_path, monkeypatch):
         seen.append((search, trials))
         raise PCRError("enough")
 
-    monkeypatch.setattr("pcr_mpc.cli_study.tune", stopped)
+    monkeypatch.setattr("pcr_mpc.cli.study.tune", stopped)
     scene = str(tmp_path / "models/scenes/limited.toml")
     url = f"sqlite:///{tmp_path / 'shared.db'}"
     assert main(["tune", scene]) == 1

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pcr_mpc import ModelError, Uncertainty, load_scene, make_controller, simulate
-from pcr_mpc.loop.controllers import HoldMotors
-from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.trajectory import Hold
+from pcr_mpc.loop.demand.feed_forward import feed_forward
+from pcr_mpc.loop.parts.controllers import HoldMotors
+from pcr_mpc.loop.references.trajectory import Hold
 from pcr_mpc.study import episodes
 from pcr_mpc.study.episodes import ALLOWED_ERROR, EXACT, Spread, run_episode, simulate_episode
 

@@ -8,7 +8,7 @@ import pytest
 
 from pcr_mpc import load_scene
 from pcr_mpc.cli import main
-from pcr_mpc.loop.feed_forward import feed_forward
+from pcr_mpc.loop.demand.feed_forward import feed_forward
 from pcr_mpc.loop.references.path_file import load_path
 from pcr_mpc.study.excitation import MultiSine, excite, expected
 from pcr_mpc.study.identification.problem import Noise

@@ -17,7 +17,7 @@ from pcr_mpc import (
     solve_statics,
 )
 from pcr_mpc.cli import main
-from pcr_mpc.loop.trajectory import Hold, PickAndPlace
+from pcr_mpc.loop.references.trajectory import Hold, PickAndPlace
 
 from .conftest import MODELS
 

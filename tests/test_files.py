@@ -13,7 +13,7 @@ import pytest
 
 from pcr_mpc import HoldMotors, load_scene, load_tuning, simulate
 from pcr_mpc.cli import main
-from pcr_mpc.cli_parser import METHODS
+from pcr_mpc.cli.parser import METHODS
 from pcr_mpc.errors import OutputError
 from pcr_mpc.files import ours, replacing, require_free, results, stamped, write_text
 from pcr_mpc.plant.statics import held_tip as statics
@@ -41,9 +41,9 @@ def quick(monkeypatch, run):
         calls.append(arguments)
         return run
 
-    monkeypatch.setattr("pcr_mpc.cli_track.simulate", known)
+    monkeypatch.setattr("pcr_mpc.cli.track.simulate", known)
     for name in ("plot_run", "animate_run"):
-        monkeypatch.setattr(f"pcr_mpc.cli_track.{name}", lambda run, path, **_: path.write_bytes(b"picture"))
+        monkeypatch.setattr(f"pcr_mpc.cli.track.{name}", lambda run, path, **_: path.write_bytes(b"picture"))
     return calls
 
 
@@ -175,7 +175,7 @@ def test_a_run_that_cannot_be_drawn_keeps_its_figures(quick, tmp_path, capsys, m
     def lost(*_):
         raise OutputError("no rods there")
 
-    monkeypatch.setattr("pcr_mpc.cli_track.plot_run", lost)
+    monkeypatch.setattr("pcr_mpc.cli.track.plot_run", lost)
     assert main(["track", str(RELEASE), "--out", str(tmp_path), "--json"]) == 0
     captured = capsys.readouterr()
     assert "no pictures: no rods there" in captured.err
@@ -186,7 +186,7 @@ def test_tune_leaves_a_tuning_by_hand_alone(tmp_path, capsys, monkeypatch):
     shutil.copytree(MODELS, tmp_path / "models")
     shutil.copytree(CONTROLLERS, tmp_path / "controllers")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pcr_mpc.cli_study.tune", lambda *_: pytest.fail("before it is known where to write"))
+    monkeypatch.setattr("pcr_mpc.cli.study.tune", lambda *_: pytest.fail("before it is known where to write"))
     scene, mine = tmp_path / "models/scenes/lemniscate.toml", tmp_path / "controllers/mine.toml"
     scene.write_text(scene.read_text().replace('name = "lemniscate"', 'name = "mine"'))
     text = "# worked out by hand\n" + (CONTROLLERS / "default.toml").read_text().replace('"default"', '"mine"')

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import SimulationError, load_scene, simulate
-from pcr_mpc.loop.controllers import Decision
+from pcr_mpc.loop.parts.controllers import Decision
 
 from .conftest import MODELS
 
@@ -35,7 +35,7 @@ def changed(**attributes):
 @pytest.mark.parametrize(
     ("controller", "message"),
     [
-        (changed(start=None), "controller Mine has no method 'start'; see pcr_mpc.loop.controllers.Controller"),
+        (changed(start=None), "controller Mine has no method 'start'; see pcr_mpc.loop.parts.controllers.Controller"),
         (changed(name=3), "controller Mine has name = 3, expected a str"),
         (changed(step=lambda self, x: None), r"controller Mine: step\(x\) is called with 2 arguments"),
         (changed(start=lambda self: None), r"controller Mine: start\(\) is called with 1 arguments"),

@@ -16,8 +16,8 @@ from pcr_mpc import (
     simulate,
     solve_statics,
 )
-from pcr_mpc.loop.foresight import Foresight
-from pcr_mpc.loop.foresight_graph import Places
+from pcr_mpc.loop.parts.foresight import Foresight
+from pcr_mpc.loop.parts.foresight_graph import Places
 
 from .conftest import CONTROLLERS, MODELS
 

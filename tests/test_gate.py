@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import PCRError, SimulationError, inverse_statics, load_scene, load_tuning, make_controller, simulate
-from pcr_mpc.loop.controllers import Replay
-from pcr_mpc.loop.gate import PATIENCE, _Sensor
+from pcr_mpc.loop.parts.controllers import Replay
+from pcr_mpc.loop.parts.gate import PATIENCE, _Sensor
 
 from .conftest import CONTROLLERS, MODELS
 

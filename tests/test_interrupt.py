@@ -99,7 +99,7 @@ def test_waiting_for_workers_ends_too():
 
 @pytest.mark.parametrize(("kind", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_track_keeps_what_it_has_and_exits_by_the_signal(tmp_path, monkeypatch, capsys, kind, status):
-    monkeypatch.setattr("pcr_mpc.cli_track.make_controller", lambda scene, tuning: Pressed(2, 5, kind))
+    monkeypatch.setattr("pcr_mpc.cli.track.make_controller", lambda scene, tuning: Pressed(2, 5, kind))
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
         assert main(["track", str(MODELS / "scenes/release.toml"), "--out", str(tmp_path), "--json"]) == status

@@ -10,7 +10,7 @@ from pcr_mpc.cli import main
 from pcr_mpc.codegen.scope import check_scope
 from pcr_mpc.control.tuning import LearningTuning
 from pcr_mpc.errors import GenerationError, ModelError
-from pcr_mpc.loop.feed_forward import feed_forward
+from pcr_mpc.loop.demand.feed_forward import feed_forward
 from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.learning.harmonics import Harmonics
 from pcr_mpc.loop.learning.laps import laps_of
@@ -222,7 +222,7 @@ def test_tunings_and_records_keep_it(scene, tmp_path):
 
 @pytest.mark.slow
 def test_the_command_shows_the_laps(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pcr_mpc.cli_track.animate_run", lambda run, path, progress: path.write_bytes(b"GIF89a"))
+    monkeypatch.setattr("pcr_mpc.cli.track.animate_run", lambda run, path, progress: path.write_bytes(b"GIF89a"))
     text = (CONTROLLERS / "lemniscate.toml").read_text(encoding="utf-8")
     (tmp_path / "learns.toml").write_text(text + "\n[learning]\non = true\n")
     text = (

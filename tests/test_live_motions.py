@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc.loop.live.motions import Following, Pursuit, as_trajectory
-from pcr_mpc.loop.trajectory import Hold, Lemniscate
+from pcr_mpc.loop.references.trajectory import Hold, Lemniscate
 
 PERIOD = 0.01
 LEMNISCATE = Lemniscate((0.0, 0.25), (0.12, 0.06), 2.0, 1.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import MATERIALS, Material, ModelError, Rod, Section, inverse_statics, load_robot
-from pcr_mpc.loop.record import from_text, to_text
+from pcr_mpc.loop.run.record import from_text, to_text
 
 from .conftest import MODELS, ROOT
 

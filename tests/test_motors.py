@@ -7,10 +7,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from pcr_mpc import ModelError, load_scene, make_controller, simulate
-from pcr_mpc.loop.controllers import Replay
-from pcr_mpc.loop.finding import digest
 from pcr_mpc.loop.hardware.motors import Motors
-from pcr_mpc.loop.record import from_text, to_text
+from pcr_mpc.loop.parts.controllers import Replay
+from pcr_mpc.loop.run.finding import digest
+from pcr_mpc.loop.run.record import from_text, to_text
 
 from .conftest import MODELS
 

@@ -23,7 +23,7 @@ from pcr_mpc import (
     summary_table,
 )
 from pcr_mpc.cli import main
-from pcr_mpc.loop.own_controller import OwnController, built
+from pcr_mpc.loop.controller.own_controller import OwnController, built
 from pcr_mpc.study.episodes import EXACT
 from pcr_mpc.study.provenance import described
 

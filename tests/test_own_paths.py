@@ -9,8 +9,8 @@ import pytest
 
 from pcr_mpc import Blended, Circle, load_run, load_scene, load_tuning, make_controller, run_episode, simulate
 from pcr_mpc.errors import StudyError
-from pcr_mpc.loop.finding import digest
 from pcr_mpc.loop.references.reading import built_in
+from pcr_mpc.loop.run.finding import digest
 from pcr_mpc.report.plots import animate_run, plot_run
 from pcr_mpc.study import episodes
 from pcr_mpc.study.episodes import Spread

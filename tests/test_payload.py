@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import ModelError, Plant, inverse_statics, linearise, load_scene, make_controller, simulate
-from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.settings import Payload
+from pcr_mpc.loop.demand.feed_forward import feed_forward
+from pcr_mpc.loop.scene.settings import Payload
 
 from .conftest import MODELS
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import InfeasibleError, Plant, load_scene
-from pcr_mpc.loop.parts import motor_limits
-from pcr_mpc.loop.tracking import TrackingController
+from pcr_mpc.loop.controller.tracking import TrackingController
+from pcr_mpc.loop.parts.assembled import motor_limits
 
 from .conftest import MODELS
 

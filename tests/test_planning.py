@@ -25,7 +25,7 @@ from pcr_mpc import (
 )
 from pcr_mpc.cli import main
 from pcr_mpc.linearisation.pose_limits import PoseLimits
-from pcr_mpc.loop.trajectory import PickAndPlace, smooth_step
+from pcr_mpc.loop.references.trajectory import PickAndPlace, smooth_step
 from pcr_mpc.report.planning import plan_table
 from pcr_mpc.study.planning.course import paced
 from pcr_mpc.study.planning.fastest import Problem, evaluated

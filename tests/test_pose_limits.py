@@ -27,7 +27,7 @@ from pcr_mpc.control.workspace import Check
 from pcr_mpc.linearisation.linear_limits import LinearLimits
 from pcr_mpc.linearisation.linear_model import LinearModels
 from pcr_mpc.linearisation.pose_limits import LimitWatch, PoseLimits
-from pcr_mpc.loop.trajectory import PickAndPlace
+from pcr_mpc.loop.references.trajectory import PickAndPlace
 from pcr_mpc.plant.rods import elastica
 
 from .conftest import CONTROLLERS, MODELS

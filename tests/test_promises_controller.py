@@ -16,13 +16,13 @@ from pcr_mpc import (
     simulate,
     solve_statics,
 )
-from pcr_mpc.loop.controllers import HoldMotors
-from pcr_mpc.loop.feed_forward import _momentum, feed_forward
-from pcr_mpc.loop.parts import motor_limits
-from pcr_mpc.loop.settings import Payload
-from pcr_mpc.loop.target import MotorTarget
-from pcr_mpc.loop.tracking import TrackingController
-from pcr_mpc.loop.trajectory import PickAndPlace
+from pcr_mpc.loop.controller.tracking import TrackingController
+from pcr_mpc.loop.demand.feed_forward import _momentum, feed_forward
+from pcr_mpc.loop.parts.assembled import motor_limits
+from pcr_mpc.loop.parts.controllers import HoldMotors
+from pcr_mpc.loop.parts.target import MotorTarget
+from pcr_mpc.loop.references.trajectory import PickAndPlace
+from pcr_mpc.loop.scene.settings import Payload
 
 from .conftest import CONTROLLERS, MODELS
 
@@ -136,7 +136,7 @@ def test_without_a_model_the_tuning_says_whether_to_raise(scene, fallback, monke
     def failing(*_):
         raise ConvergenceError("made up", residual=1.0, iterations=1, last=None)
 
-    monkeypatch.setattr("pcr_mpc.loop.foresight.Foresight.__call__", failing)
+    monkeypatch.setattr("pcr_mpc.loop.parts.foresight.Foresight.__call__", failing)
     if fallback == "raise":
         with pytest.raises(ConvergenceError, match="made up"):
             controller.step(0, at_rest(pose))

@@ -7,8 +7,9 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from pcr_mpc import HoldMotors, cli_study, load_scene, load_tuning, simulate
+from pcr_mpc import HoldMotors, load_scene, load_tuning, simulate
 from pcr_mpc.cli import main
+from pcr_mpc.cli import study as cli_study
 from pcr_mpc.plant.statics.stability import assess_stability
 from pcr_mpc.report.choice_tables import choice_record, choice_table
 from pcr_mpc.report.tables import (
@@ -281,7 +282,7 @@ def test_an_interrupt_has_its_own_status(words, said, monkeypatch, capsys):
 def test_seeds_reach_the_noise(tmp_path, capsys, monkeypatch):
     """Another seed, another run; the record says which."""
     scene = replace(load_scene(SCENES / "sensors.toml"), duration=0.05)
-    monkeypatch.setattr("pcr_mpc.cli_track.load_scene", lambda path: scene)
+    monkeypatch.setattr("pcr_mpc.cli.track.load_scene", lambda path: scene)
     hashes = []
     for seed in ("3", "4"):
         assert (

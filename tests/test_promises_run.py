@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import HoldMotors, SimulationError, simulate
-from pcr_mpc.loop.settings import Finding, Need
+from pcr_mpc.loop.scene.settings import Finding, Need
 
 from .test_promises_simulate import PER, PERIODS, resting
 
@@ -123,7 +123,7 @@ def test_the_need_is_held_against_medians_and_against_what_was_found(run, monkey
     need = Need(tip_accuracy=2e-4, plant_step=30e-6, control_step=50e-6)
     times = {"plant_time": np.full(PERIODS * PER, 30e-6), "control_time": np.full((PERIODS, 6), 50e-6)}
     asked = replace(run, scene=replace(run.scene, need=need, finding=Finding(1e-4, 0.0, "abc")), **times)
-    monkeypatch.setattr("pcr_mpc.loop.run_summary.verified", lambda scene: True)
+    monkeypatch.setattr("pcr_mpc.loop.run.summary.verified", lambda scene: True)
     found = asked.summary()["need"]
     assert found == {
         "tip_accuracy_mm": pytest.approx(0.2), "tip_error_mm": pytest.approx(0.1), "verified": True,

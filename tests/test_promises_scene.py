@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pcr_mpc import ModelError, load_scene
-from pcr_mpc.loop.finding import digest, verified
-from pcr_mpc.loop.settings import Finding, Need, Payload
-from pcr_mpc.loop.trajectory import Lemniscate
+from pcr_mpc.loop.references.trajectory import Lemniscate
+from pcr_mpc.loop.run.finding import digest, verified
+from pcr_mpc.loop.scene.settings import Finding, Need, Payload
 
 from .conftest import CONTROLLERS, MODELS
 

@@ -7,7 +7,7 @@ import pytest
 
 from pcr_mpc import HoldMotors, SimulationError, load_scene, simulate
 from pcr_mpc.control.plan import Plan
-from pcr_mpc.loop.controllers import Decision, Replay
+from pcr_mpc.loop.parts.controllers import Decision, Replay
 from pcr_mpc.plant.statics.solver import Snap
 
 from .conftest import MODELS
@@ -70,7 +70,7 @@ def test_what_a_decision_and_a_step_take_is_measured(scene, monkeypatch):
             clock.pass_by(5e-5, 0.0)
             return self._plant.step(*arguments)
 
-    monkeypatch.setattr("pcr_mpc.loop.simulate.time", clock)
+    monkeypatch.setattr("pcr_mpc.loop.run.simulate.time", clock)
     clock.pass_by(1234.5, 67.8)
     run = simulate(scene, Heavy(scene.make_plant()), Thinking(2))
     assert run.control_time[:, 0] == pytest.approx(3e-3 + 1e-3 * np.arange(PERIODS))

@@ -8,7 +8,7 @@ import pytest
 
 from pcr_mpc import load_scene
 from pcr_mpc.errors import ModelError
-from pcr_mpc.loop.settings import PlantSettings
+from pcr_mpc.loop.scene.settings import PlantSettings
 from pcr_mpc.study import choice as choosing
 from pcr_mpc.study import episodes, tuning_score
 from pcr_mpc.study.choice import Bench, Choice, Measured

@@ -9,8 +9,8 @@ import pytest
 
 from pcr_mpc import load_scene, load_tuning
 from pcr_mpc.control.plan import Plan
-from pcr_mpc.loop.controllers import Decision
-from pcr_mpc.loop.tracking import TrackingController
+from pcr_mpc.loop.controller.tracking import TrackingController
+from pcr_mpc.loop.parts.controllers import Decision
 from pcr_mpc.report.timing import timing_tables
 from pcr_mpc.study import timing
 from pcr_mpc.study.episodes import Spread

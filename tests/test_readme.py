@@ -6,7 +6,7 @@ import shlex
 import numpy as np
 import pytest
 
-from pcr_mpc import cli
+from pcr_mpc.cli import main
 
 from .conftest import ROOT
 
@@ -47,7 +47,7 @@ def test_tutorial_to_the_letter(monkeypatch, tmp_path, capsys):
     commands = [line for block in blocks(page, "") for line in block.splitlines()]
     assert [line.split()[1] for line in commands] == ["new", "new", "check", "track"]
     for line in commands:
-        status = cli.main(shlex.split(line)[1:])
+        status = main(shlex.split(line)[1:])
         said = capsys.readouterr()
         # The second one shows a robot that cannot be.
         assert (status == 0) == (" stiff " not in line), said.err

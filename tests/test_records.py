@@ -18,8 +18,8 @@ from pcr_mpc import (
     simulate,
     solve_statics,
 )
-from pcr_mpc.loop.controllers import Replay
-from pcr_mpc.loop.record import from_text, to_text
+from pcr_mpc.loop.parts.controllers import Replay
+from pcr_mpc.loop.run.record import from_text, to_text
 
 from .conftest import MODELS
 

@@ -9,7 +9,7 @@ import pytest
 
 from pcr_mpc import ConvergenceError, ModelError, PCRError, Plant, forward_statics, load_robot, load_scene
 from pcr_mpc.buffered import BufferedFunction
-from pcr_mpc.cli_study import _ended
+from pcr_mpc.cli.study import _ended
 from pcr_mpc.compiled import compiled
 from pcr_mpc.control.daqp_solver import DAQPSolver
 from pcr_mpc.control.nonlinear_mpc import NonlinearMPC

@@ -12,8 +12,8 @@ from pcr_mpc.control.laws import LQR, PD, FeedForward
 from pcr_mpc.control.observer import ObserverTuning
 from pcr_mpc.control.tuning import Limits
 from pcr_mpc.errors import PCRError, ReadOnlyError
-from pcr_mpc.loop.foresight import Foresight
-from pcr_mpc.loop.parts import motor_limits
+from pcr_mpc.loop.parts.assembled import motor_limits
+from pcr_mpc.loop.parts.foresight import Foresight
 
 from .conftest import CONTROLLERS, MODELS
 

@@ -8,8 +8,8 @@ import pytest
 
 from pcr_mpc import ModelError, load_robot, load_scene, load_tuning
 from pcr_mpc.files import name_problem
-from pcr_mpc.loop.settings import Need, Payload
-from pcr_mpc.loop.trajectory import Hold, Lemniscate, PickAndPlace
+from pcr_mpc.loop.references.trajectory import Hold, Lemniscate, PickAndPlace
+from pcr_mpc.loop.scene.settings import Need, Payload
 from pcr_mpc.study.episodes import Spread
 from pcr_mpc.study.tuning_space import Search, space
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import ModelError, load_robot, load_scene, load_tuning
-from pcr_mpc.loop.trajectory import Hold, Lemniscate, PickAndPlace
+from pcr_mpc.loop.references.trajectory import Hold, Lemniscate, PickAndPlace
 
 from .conftest import CONTROLLERS, MODELS
 

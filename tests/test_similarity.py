@@ -21,8 +21,8 @@ from pcr_mpc.control.mpc import riccati
 from pcr_mpc.control.nonlinear_mpc import NonlinearMPC
 from pcr_mpc.control.observer import DisturbanceObserver
 from pcr_mpc.linearisation.pose_limits import LimitWatch, PoseLimits
-from pcr_mpc.loop.make_controller import make_controller
-from pcr_mpc.loop.parts import motor_limits
+from pcr_mpc.loop.controller.make_controller import make_controller
+from pcr_mpc.loop.parts.assembled import motor_limits
 from pcr_mpc.plant.statics.stability import all_equilibria, assess_stability, distance_to_fold
 from pcr_mpc.plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 

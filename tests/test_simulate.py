@@ -15,8 +15,8 @@ from pcr_mpc import (
     make_controller,
     simulate,
 )
-from pcr_mpc.loop.controllers import Replay
-from pcr_mpc.loop.trajectory import Hold
+from pcr_mpc.loop.parts.controllers import Replay
+from pcr_mpc.loop.references.trajectory import Hold
 
 from .conftest import CONTROLLERS, MODELS
 

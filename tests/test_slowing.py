@@ -19,9 +19,9 @@ from pcr_mpc import (
     make_controller,
     simulate,
 )
-from pcr_mpc.loop.feasibility import reference_demand, reference_excess
-from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.smoothness import contradictions, jumps
+from pcr_mpc.loop.demand.feasibility import reference_demand, reference_excess
+from pcr_mpc.loop.demand.feed_forward import feed_forward
+from pcr_mpc.loop.references.smoothness import contradictions, jumps
 from pcr_mpc.report.tables import summary_table
 
 from .conftest import MODELS

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import AmbiguousPoseError, MeasurementError, PCRError, Sensors, inverse_statics, load_robot, solve_statics
-from pcr_mpc.loop.start_pose import find_start
+from pcr_mpc.loop.parts.start_pose import find_start
 
 from .conftest import MODELS
 

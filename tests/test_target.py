@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import ConvergenceError, inverse_statics, load_scene
-from pcr_mpc.loop.feed_forward import feed_forward
-from pcr_mpc.loop.target import MotorTarget
+from pcr_mpc.loop.demand.feed_forward import feed_forward
+from pcr_mpc.loop.parts.target import MotorTarget
 
 from .conftest import MODELS
 
@@ -40,7 +40,7 @@ def test_shift_carries_the_force(lemniscate, reference, k):
 
 
 def test_inverse_dynamics_that_do_not_settle_are_refused(lemniscate, monkeypatch):
-    monkeypatch.setattr("pcr_mpc.loop.feed_forward._MOST_SWEEPS", 1)
+    monkeypatch.setattr("pcr_mpc.loop.demand.feed_forward._MOST_SWEEPS", 1)
     with pytest.raises(ConvergenceError, match=r"did not settle.*slower reference") as caught:
         feed_forward(lemniscate, lemniscate.robot, lemniscate.start(), 10, "condensed")
     assert 1e-5 < caught.value.residual < 1e-1

@@ -24,7 +24,7 @@ from pcr_mpc import (
 )
 from pcr_mpc.buffered import graph_cache, per_thread
 from pcr_mpc.control.mpc import LinearMPC
-from pcr_mpc.loop.parts import motor_limits
+from pcr_mpc.loop.parts.assembled import motor_limits
 
 from .conftest import CONTROLLERS, MODELS
 

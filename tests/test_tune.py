@@ -370,7 +370,7 @@ def test_a_scene_that_was_tuned_is_tuned_from_the_default_again(tmp_path, monkey
         searches.append(search)
         raise PCRError("enough")
 
-    monkeypatch.setattr("pcr_mpc.cli_study.tune", stopped)
+    monkeypatch.setattr("pcr_mpc.cli.study.tune", stopped)
     assert main(["tune", str(scene)]) == 1
     assert main(["tune", str(scene), "--start", str(CONTROLLERS / "slow_motors.toml")]) == 1
     assert main(["tune", str(MODELS / "scenes/limited.toml"), "--start", str(CONTROLLERS / "default.toml")]) == 1
@@ -381,8 +381,8 @@ def test_a_scene_that_was_tuned_is_tuned_from_the_default_again(tmp_path, monkey
 
 def test_tune_without_success_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pcr_mpc.cli_study.tune", lambda *_: None)
-    monkeypatch.setattr("pcr_mpc.cli_study.finished_trials", lambda _: [
+    monkeypatch.setattr("pcr_mpc.cli.study.tune", lambda *_: None)
+    monkeypatch.setattr("pcr_mpc.cli.study.finished_trials", lambda _: [
         {"trial": 0, "score": 1.0, **START.row()}, {"trial": 1, "score": 1.5, **START.row()}])  # fmt: skip
     out = tmp_path / "tuned.toml"
     assert main(["tune", str(MODELS / "scenes/lemniscate.toml"), "--trials", "1", "--out", str(out)]) == 0

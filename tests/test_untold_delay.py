@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import ModelError, Plant, load_run, load_scene, simulate
-from pcr_mpc.loop.controllers import Replay
+from pcr_mpc.loop.parts.controllers import Replay
 
 from .conftest import MODELS
 

@@ -10,7 +10,7 @@ import pytest
 
 from pcr_mpc import HoldMotors, load_scene, make_controller, simulate
 from pcr_mpc.cli import main
-from pcr_mpc.loop.controllers import Decision, Replay
+from pcr_mpc.loop.parts.controllers import Decision, Replay
 from pcr_mpc.report.tables import summary_table
 
 from .conftest import CONTROLLERS, MODELS

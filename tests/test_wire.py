@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from pcr_mpc.control.tuning import Limits
 from pcr_mpc.errors import OutputError, PCRError
-from pcr_mpc.loop.parts import resting_state
-from pcr_mpc.loop.scene_file import load_scene
+from pcr_mpc.loop.parts.assembled import resting_state
+from pcr_mpc.loop.scene.file import load_scene
 from pcr_mpc.wire.decider import make_decider
 from pcr_mpc.wire.hil import run_hil
 from pcr_mpc.wire.packet import (

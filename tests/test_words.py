@@ -28,8 +28,8 @@ from pcr_mpc import (
 )
 from pcr_mpc.cli import main
 from pcr_mpc.control.observer import ObserverTuning
-from pcr_mpc.loop.finding import digest
-from pcr_mpc.loop.settings import Finding
+from pcr_mpc.loop.run.finding import digest
+from pcr_mpc.loop.scene.settings import Finding
 from pcr_mpc.plant.statics.free_tip import _require_usable
 from pcr_mpc.study.episodes import Spread, run_episode
 from pcr_mpc.study.provenance import described, differences

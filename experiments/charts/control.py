@@ -21,8 +21,8 @@ import numpy as np
 
 from experiments.charts.points import Key, Row, times
 from pcr_mpc import PCRError, SimulationError, Tuning, load_scene, load_tuning, make_controller, simulate
-from pcr_mpc.loop.controllers import Controller
-from pcr_mpc.loop.scene import Scene
+from pcr_mpc.loop.parts.controllers import Controller
+from pcr_mpc.loop.scene.scene import Scene
 
 ROOT = Path(__file__).parent.parent.parent
 SCENES = {"nominal": "lemniscate", "limited": "limited"}

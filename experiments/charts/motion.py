@@ -26,7 +26,7 @@ from experiments.charts.statics import LITERAL, LITERAL_AT_ONCE
 from experiments.literal_reading import LiteralReading, Solution
 from experiments.rod_inertia import RELEASES, STEP, start
 from pcr_mpc import PCRError, Plant, Robot
-from pcr_mpc.loop.simulated_plant import SimulatedPlant
+from pcr_mpc.loop.run.simulated_plant import SimulatedPlant
 from pcr_mpc.plant.motion.rollout import rollout
 
 YARDSTICK, MUJOCO, ELASTICA = "yardstick", "MuJoCo", "PyElastica"

@@ -11,7 +11,7 @@ import numpy as np
 from experiments.charts.points import Row, times
 from experiments.rod_inertia import STEP, start
 from pcr_mpc import Equilibrium, PCRError, Plant, Robot
-from pcr_mpc.loop.simulated_plant import SimulatedPlant
+from pcr_mpc.loop.run.simulated_plant import SimulatedPlant
 
 _BLOCK = 1e-2  # s, whose wall time is one measurement
 MODES, FINEST = 14, STEP / 2  # of the yardstick

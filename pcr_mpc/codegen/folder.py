@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..files import require_free, results, write_text
-from ..loop.run import Run
+from ..loop.run.run import Run
 from .readme import readme
 from .solver import licence, sources
 from .subject import Subject

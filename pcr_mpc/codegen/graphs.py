@@ -11,7 +11,7 @@ from ..buffered import building
 from ..control.condensing import checking
 from ..control.mpc import LinearMPC
 from ..linearisation.model_graph import force_graph
-from ..loop.foresight_graph import Places, foresight_graph
+from ..loop.parts.foresight_graph import Places, foresight_graph
 from ..plant.motion.plant import Plant
 from ..plant.motion.step_graph import StepModel, step_graph
 from ..plant.rods import elastica

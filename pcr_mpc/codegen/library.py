@@ -11,7 +11,7 @@ import numpy as np
 
 from ..control.plan import Plan
 from ..errors import CompilerError, MeasurementError, PCRError
-from ..loop.controllers import Decision
+from ..loop.parts.controllers import Decision
 from ..plant.statics.equilibrium import Equilibrium
 from .subject import KIND_BITS, Subject
 from .vectors import RUNGS

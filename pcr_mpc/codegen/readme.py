@@ -6,7 +6,7 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
-from ..loop.run import Run
+from ..loop.run.run import Run
 from .subject import Subject
 
 _TEXT = Path(__file__).parent / "c" / "readme.md"

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..control.tuning import Tuning
 from ..errors import GenerationError
-from ..loop.scene import Scene
+from ..loop.scene.scene import Scene
 
 # What of a scene, a tuning and its model C knows, or need not know; all else must be as it is by default.
 _KNOWN = {

@@ -11,11 +11,11 @@ import numpy as np
 from ..control.mpc import LinearMPC, riccati
 from ..control.tuning import Tuning
 from ..linearisation.pose_limits import PoseLimits
-from ..loop.control_step import ControlStep
-from ..loop.make_controller import make_controller
-from ..loop.parts import resting_model, resting_state
-from ..loop.scene import Scene
-from ..loop.tracking import TrackingController
+from ..loop.controller.control_step import ControlStep
+from ..loop.controller.make_controller import make_controller
+from ..loop.controller.tracking import TrackingController
+from ..loop.parts.assembled import resting_model, resting_state
+from ..loop.scene.scene import Scene
 from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium

@@ -11,7 +11,7 @@ import numpy as np
 from ..control.limited_qp import PENALTY
 from ..control.qp import stage_weights
 from ..linearisation.model_graph import sizes
-from ..loop.parts import tip_noise
+from ..loop.parts.assembled import tip_noise
 from ..plant.motion.step_graph import limits as step_limits
 from ..plant.rods.chart import critical_load_table
 from .ctext import array, block, defines, number, structure

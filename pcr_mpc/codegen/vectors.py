@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import GenerationError, SimulationError
-from ..loop.make_controller import make_controller
-from ..loop.run import Run
-from ..loop.simulate import simulate
+from ..loop.controller.make_controller import make_controller
+from ..loop.run.run import Run
+from ..loop.run.simulate import simulate
 from .ctext import array, number
 from .subject import Subject
 

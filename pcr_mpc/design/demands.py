@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import PCRError
-from ..loop.feasibility import reference_demand, reference_excess
-from ..loop.feed_forward import InverseDynamics, feed_forward
-from ..loop.scene import Scene
-from ..loop.trajectory import sampled
+from ..loop.demand.feasibility import reference_demand, reference_excess
+from ..loop.demand.feed_forward import InverseDynamics, feed_forward
+from ..loop.references.trajectory import sampled
+from ..loop.scene.scene import Scene
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.held_tip import solve_statics
 from .remarks import NEAR, Remark

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import interrupt
 from ..errors import ModelError, PCRError
-from ..loop.scene import Scene
+from ..loop.scene.scene import Scene
 from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium

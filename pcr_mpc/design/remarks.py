@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..loop.scene import Scene
+from ..loop.scene.scene import Scene
 from ..plant.motion.step_limit import longest_step
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium

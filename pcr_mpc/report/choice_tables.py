@@ -6,8 +6,8 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from ..loop.scene import Scene
-from ..loop.settings import PlantSettings
+from ..loop.scene.scene import Scene
+from ..loop.scene.settings import PlantSettings
 from ..study.choice import Choice, Measured, apart
 from ..study.estimates import Estimate
 from ..study.rungs import ladders, levels, named

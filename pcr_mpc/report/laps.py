@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from ..loop.run import Run
+from ..loop.run.run import Run
 from .style import BLUE, GREY, plt, save_figure
 
 

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from .. import interrupt
 from ..files import replacing
-from ..loop.run import Run
+from ..loop.run.run import Run
 from ..plant.motion.plant import Plant
 from ..plant.statics.equilibrium import Equilibrium
 from .style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, RODS, plt, save_figure

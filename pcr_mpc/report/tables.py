@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..loop.feasibility import demand_line
+from ..loop.demand.feasibility import demand_line
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.stability import assess_stability
 from ..study.tuning_space import Search

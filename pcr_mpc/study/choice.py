@@ -11,12 +11,12 @@ from tqdm import tqdm
 
 from .. import interrupt
 from ..errors import NoRungError, PCRError, SimulationError
-from ..loop.controllers import Replay
-from ..loop.make_controller import make_controller
-from ..loop.run import Run
-from ..loop.scene import Scene
-from ..loop.settings import Need, PlantSettings
-from ..loop.simulate import simulate
+from ..loop.controller.make_controller import make_controller
+from ..loop.parts.controllers import Replay
+from ..loop.run.run import Run
+from ..loop.run.simulate import simulate
+from ..loop.scene.scene import Scene
+from ..loop.scene.settings import Need, PlantSettings
 from ..plant.uncertainty import Uncertainty
 from .estimates import Estimate, Estimates
 from .numbers_cost import NumbersCost, numbers_cost

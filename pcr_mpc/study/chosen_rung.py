@@ -10,9 +10,9 @@ from typing import Any
 
 from ..errors import ModelError
 from ..files import replacing
-from ..loop.finding import digest
-from ..loop.scene_file import load_scene
-from ..loop.settings import PlantSettings
+from ..loop.run.finding import digest
+from ..loop.scene.file import load_scene
+from ..loop.scene.settings import PlantSettings
 from .choice import Choice
 from .rungs import ladders, named
 

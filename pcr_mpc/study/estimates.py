@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import PCRError
-from ..loop.scene import Scene
-from ..loop.settings import PlantSettings
+from ..loop.scene.scene import Scene
+from ..loop.scene.settings import PlantSettings
 from ..plant.motion.plant import Plant
 from ..plant.rod import Rod
 from ..plant.statics.equilibrium import Equilibrium

@@ -12,10 +12,10 @@ from tqdm import tqdm
 from .. import interrupt
 from ..errors import IdentificationError, PCRError, checked_integer, checked_number
 from ..frozen import Frozen
-from ..loop.feed_forward import InverseDynamics, feed_forward
-from ..loop.scene import Scene
-from ..loop.slowing import Slowed
-from ..loop.trajectory import Lemniscate, Trajectory, smooth_step
+from ..loop.demand.feed_forward import InverseDynamics, feed_forward
+from ..loop.demand.slowing import Slowed
+from ..loop.references.trajectory import Lemniscate, Trajectory, smooth_step
+from ..loop.scene.scene import Scene
 from ..plant.uncertainty import Uncertainty
 from .identification.information import information
 from .identification.log import Log

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..files import stamped, write_text
-from ..loop.scene_file import load_scene
+from ..loop.scene.file import load_scene
 from .excitation import Excitation
 
 PATH = "excited.csv"

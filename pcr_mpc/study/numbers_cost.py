@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import PCRError
-from ..loop.run import Run
+from ..loop.run.run import Run
 from ..plant.motion.plant import Plant
 from ..plant.motion.rollout import rollout
 from ..plant.motion.sensitivities import sensitivities

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ..control.tuning import Tuning
-from ..loop.finding import own_motion
-from ..loop.own_controller import OwnController
-from ..loop.scene import Scene
+from ..loop.controller.own_controller import OwnController
+from ..loop.run.finding import own_motion
+from ..loop.scene.scene import Scene
 from ..plain import plain
 from .episodes import Maker
 from .spread import Spread

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import product
 
-from ..loop.scene import Scene
-from ..loop.settings import PAYLOADS, RODS, PlantSettings
+from ..loop.scene.scene import Scene
+from ..loop.scene.settings import PAYLOADS, RODS, PlantSettings
 from ..plant.rods.inertia import INERTIAS
 from ..plant.statics.weight import WEIGHTS
 

@@ -9,12 +9,12 @@ import numpy as np
 
 from .. import interrupt
 from ..compiled import has_compiler
-from ..loop.feed_forward import feed_forward
-from ..loop.make_controller import make_controller
-from ..loop.run import Run
-from ..loop.scene import Scene
-from ..loop.simulate import simulate
-from ..loop.tracking import TrackingController
+from ..loop.controller.make_controller import make_controller
+from ..loop.controller.tracking import TrackingController
+from ..loop.demand.feed_forward import feed_forward
+from ..loop.run.run import Run
+from ..loop.run.simulate import simulate
+from ..loop.scene.scene import Scene
 from ..methods import METHODS
 from ..plant.motion.plant import DERIVATIVE_ACCURACY, Plant
 from .machine import machine, versions

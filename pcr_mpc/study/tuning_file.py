@@ -9,8 +9,8 @@ from pathlib import Path
 from ..control.tuning import Tuning, load_tuning
 from ..errors import ModelError, StudyError
 from ..files import replacing, require_free, stamped
-from ..loop.scene import Scene
-from ..loop.scene_file import load_scene
+from ..loop.scene.file import load_scene
+from ..loop.scene.scene import Scene
 from ..toml_table import read_toml
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..control.tuning import Tuning
 from ..errors import MarginsError
-from ..loop.scene import Scene
+from ..loop.scene.scene import Scene
 from .episodes import Row, run_episode
 from .margins.predicted import LONGEST, predict_delay_margin
 from .spread import EXACT, Spread

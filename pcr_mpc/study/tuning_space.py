@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..control.tuning import LINEARISE, Tuning
 from ..errors import PCRError
-from ..loop.scene import Scene
-from ..loop.scene_checks import is_multiple
+from ..loop.scene.checks import is_multiple
+from ..loop.scene.scene import Scene
 from .spread import Spread
 
 if TYPE_CHECKING:

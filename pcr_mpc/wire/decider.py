@@ -14,10 +14,10 @@ from ..codegen.library import GeneratedController, build
 from ..codegen.subject import Subject
 from ..control.tuning import Limits
 from ..errors import GenerationError, PCRError
-from ..loop.make_controller import make_controller
-from ..loop.parts import motor_limits
-from ..loop.scene import Scene
-from ..loop.tracking import TrackingController
+from ..loop.controller.make_controller import make_controller
+from ..loop.controller.tracking import TrackingController
+from ..loop.parts.assembled import motor_limits
+from ..loop.scene.scene import Scene
 from .packet import RESTING, Command, Measurement
 
 _RUNGS = {None: 0, "softened": 1, "shifted_plan": 2, "lqr": 3, "hold": 4}

@@ -20,10 +20,10 @@ from tqdm import tqdm
 
 from .. import interrupt
 from ..errors import PCRError, SimulationError
-from ..loop.make_controller import make_controller
-from ..loop.parts import resting_state
-from ..loop.scene import Scene
-from ..loop.simulate import simulate
+from ..loop.controller.make_controller import make_controller
+from ..loop.parts.assembled import resting_state
+from ..loop.run.simulate import simulate
+from ..loop.scene.scene import Scene
 from .packet import RESTING, Measurement, command_size, pack_measurement, unpack_command
 
 _PATIENCE = 120.0  # s, until the controller's process listens

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..references.blended import Blended
-from ..trajectory import Lemniscate, Trajectory, risen
+from ..references.trajectory import Lemniscate, Trajectory, risen
 
 # Laps gone at times [s], their rate [1/s] and its change [1/s^2].
 Clock = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]

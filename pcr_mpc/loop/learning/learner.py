@@ -20,11 +20,11 @@ from ...errors import ModelError
 from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
-from ..feed_forward import InverseDynamics
-from ..parts import make_model
-from ..scene import Scene
-from ..track import Track
-from ..trajectory import smooth_step
+from ..demand.feed_forward import InverseDynamics
+from ..demand.track import Track
+from ..parts.assembled import make_model
+from ..references.trajectory import smooth_step
+from ..scene.scene import Scene
 from .harmonics import Harmonics
 from .laps import Laps, laps_of
 

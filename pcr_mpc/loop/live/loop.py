@@ -15,10 +15,10 @@ from ...errors import PCRError, checked_vector, measured_vector
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.held_tip import solve_statics
-from ..controllers import Decision
-from ..sensors import Sensors
-from ..start_pose import StartPose, find_start
-from ..trajectory import Trajectory
+from ..parts.controllers import Decision
+from ..parts.start_pose import StartPose, find_start
+from ..references.trajectory import Trajectory
+from ..scene.sensors import Sensors
 from .clock import Clock
 from .motions import as_trajectory
 from .reference import Event, LiveReference

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import checked_array
 from ..references.blended import Blended, duration_of
-from ..trajectory import Trajectory, sampled, smooth_step
+from ..references.trajectory import Trajectory, sampled, smooth_step
 
 _SUBSTEPS = 4  # of a period in which a target is pursued
 _DIFFERENCE = 1e-3  # s, of a function that tells positions only

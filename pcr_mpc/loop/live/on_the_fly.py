@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...errors import checked_period, measured_vector
 from ...plant.robot import Robot
-from ..controllers import Decision
+from ..parts.controllers import Decision
 from .loop import LiveLoop
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...control.qp import Reference
 from ...errors import PCRError, UnreachableError, checked_vector
 from ...plant.statics.equilibrium import Equilibrium
-from ..trajectory import Trajectory, sampled
+from ..references.trajectory import Trajectory, sampled
 from .inverse import BLOCK
 from .motions import Following, Motion, Pursuit
 from .rows import QUICKNESS, Rows

@@ -12,7 +12,7 @@ from ...errors import PCRError
 from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
-from ..settings import Payload
+from ..scene.settings import Payload
 from .inverse import OnlineInverse, Row
 from .motions import Motion, Pursuit
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from ...control.tuning import Tuning
 from ...errors import ModelError, checked_number
 from ...plant.robot import Robot
-from ..scene import Scene
-from ..sensors import Sensors
-from ..settings import PlantSettings, default_margins
-from ..trajectory import Trajectory
+from ..references.trajectory import Trajectory
+from ..scene.scene import Scene
+from ..scene.sensors import Sensors
+from ..scene.settings import PlantSettings, default_margins
 
 
 def live_scene(robot: Robot, path: Trajectory | None, tuning: Tuning, period: float, sensors: Sensors) -> Scene:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ...errors import ModelError, check_numbers, number_problem
-from ..trajectory import Trajectory, risen, sampled
+from .trajectory import Trajectory, risen, sampled
 
 # A blend takes this share of the path's duration, and no longer than that [s], where nothing else is said.
 _SHARE, _LONGEST = 0.25, 1.0

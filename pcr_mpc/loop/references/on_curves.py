@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError, check_numbers, checked_array, checked_vector, number_problem
-from ..trajectory import check_flag
 from .curves import Circular, Curve, Points, Rounded, Smooth
+from .trajectory import check_flag
 
 _POSITIVE = {"above": 0.0}
 _PEAK = 15 / 8  # largest over mean rate of a quintic from rest to rest

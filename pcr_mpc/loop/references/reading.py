@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 from ...toml_table import Table
-from ..trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 from .blended import Blended
 from .on_curves import Circle, Line, OnCurve, Polygon, Spline, Waypoints
 from .path_file import load_path
 from .tabulated import Tabulated
+from .trajectory import Hold, Lemniscate, PickAndPlace, Trajectory
 
 # What a record can hold and a digest can be made of.
 KINDS = (Hold, Lemniscate, PickAndPlace, Circle, Line, Polygon, Waypoints, Spline, Tabulated, Blended)

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.interpolate import BPoly, BSpline, CubicSpline, splprep
 
 from ...errors import ModelError, check_numbers, checked_array
-from ..trajectory import check_flag
 from .curves import Points
 from .rows import scatter
+from .trajectory import check_flag
 
 _DEGREE = 5  # of the spline that smooths: acceleration is a smooth cubic
 _LEAST = {"rows": 4, "smoothed": 8, "hermite": 2}

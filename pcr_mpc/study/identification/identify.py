@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ...errors import IdentificationError
-from ...loop.scene import Scene
+from ...loop.scene.scene import Scene
 from ...plant.uncertainty import Uncertainty
 from .balance import require_balance
 from .information import Information, information

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...errors import LogError, ModelError
 from ...frozen import Frozen
-from ...loop.run import load_run
+from ...loop.run.run import load_run
 
 # Of a row's time, in steps of the log, by which it may be beside the grid.
 _OFF_GRID = 0.05

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...loop.scene import Scene
-from ...loop.settings import PlantSettings
+from ...loop.scene.scene import Scene
+from ...loop.scene.settings import PlantSettings
 from ...plant.motion.plant import Plant
 from ...plant.motion.rollout import rollout
 from ...plant.motion.sensitivities import sensitivities

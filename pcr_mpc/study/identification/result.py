@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...frozen import Frozen
-from ...loop.scene import Scene
+from ...loop.scene.scene import Scene
 from ...plant.robot import Robot
 from ...plant.uncertainty import Uncertainty
 from .log import Log

@@ -13,14 +13,14 @@ from tqdm import tqdm
 from ... import interrupt
 from ...control.tuning import Tuning
 from ...errors import MarginsError, PCRError, SimulationError, UnstableError
-from ...loop.controllers import Decision
-from ...loop.feed_forward import InverseDynamics
-from ...loop.make_controller import make_controller
-from ...loop.run import Run
-from ...loop.scene import Scene
-from ...loop.simulate import simulate
-from ...loop.tracking import TrackingController
-from ...loop.trajectory import Hold
+from ...loop.controller.make_controller import make_controller
+from ...loop.controller.tracking import TrackingController
+from ...loop.demand.feed_forward import InverseDynamics
+from ...loop.parts.controllers import Decision
+from ...loop.references.trajectory import Hold
+from ...loop.run.run import Run
+from ...loop.run.simulate import simulate
+from ...loop.scene.scene import Scene
 from ...plant.statics.equilibrium import Equilibrium
 from .poses import LINEAR_LAWS
 

@@ -11,10 +11,10 @@ from ...control.tuning import Tuning
 from ...errors import MarginsError, PCRError
 from ...linearisation.linear_model import LinearModel
 from ...linearisation.linearise import linearise
-from ...loop.feed_forward import InverseDynamics, feed_forward
+from ...loop.demand.feed_forward import InverseDynamics, feed_forward
 from ...loop.hardware.camera import IDEAL as IDEAL_CAMERA
-from ...loop.parts import make_law, make_model, make_observer, motor_limits, pull
-from ...loop.scene import Scene
+from ...loop.parts.assembled import make_law, make_model, make_observer, motor_limits, pull
+from ...loop.scene.scene import Scene
 from ...plant.motion.plant import DERIVATIVE_ACCURACY, Plant
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium

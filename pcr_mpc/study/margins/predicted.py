@@ -12,8 +12,8 @@ import numpy as np
 
 from ...control.tuning import Tuning
 from ...frozen import Frozen
-from ...loop.feed_forward import InverseDynamics
-from ...loop.scene import Scene
+from ...loop.demand.feed_forward import InverseDynamics
+from ...loop.scene.scene import Scene
 from .linear_loop import LinearLoop, frequency_response
 from .poses import LinearLoops, PoseOfReference, scaled
 from .search import first_loss

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...control.tuning import Tuning
 from ...loop.hardware.motors import IDEAL
-from ...loop.scene import Scene
+from ...loop.scene.scene import Scene
 from .measured import Measured, measure_delay_margin, measure_largest
 from .poses import scaled_scene
 from .predicted import Margins, predict_margins

@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 
 from ...errors import ModelError
 from ...loop.references.blended import Blended
-from ...loop.trajectory import PickAndPlace, Trajectory
+from ...loop.references.trajectory import PickAndPlace, Trajectory
 from .course import Course
 from .pace import local_basis
 from .path import fitted

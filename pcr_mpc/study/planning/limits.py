@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import check_numbers
 from ...linearisation.pose_limits import PoseLimits
-from ...loop.scene import Scene
+from ...loop.scene.scene import Scene
 from ...plant.rods.chart import LEAST_CRITICAL_LOAD, critical_load
 from ...plant.statics.equilibria import Equilibria
 from .angles import Angles, followed

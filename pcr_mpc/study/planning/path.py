@@ -12,7 +12,7 @@ from scipy.sparse.linalg import splu
 
 from ...errors import ModelError, checked_array
 from ...frozen import Frozen
-from ...loop.trajectory import Trajectory, sampled
+from ...loop.references.trajectory import Trajectory, sampled
 
 _DEGREE = 7  # a motor's acceleration holds the fourth derivative, which is to have no kinks
 _SAMPLES = 8001  # of the motion whose path is taken

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from tqdm import tqdm
 
 from ...errors import ConvergenceError, InfeasibleError, ModelError, PCRError, checked_number
-from ...loop.scene import Scene
+from ...loop.scene.scene import Scene
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.free_tip import inverse_statics
 from .course import PacedPath, paced

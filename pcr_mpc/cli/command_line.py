@@ -1,0 +1,102 @@
+"""Command line: track a scene, solve a pose, time the loop, tune a controller."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import traceback
+import warnings
+from pathlib import Path
+
+from .. import interrupt
+from .parser import LEAST, parser
+
+# Arguments that name a file: a path, or the name of one of these kinds that comes with the package.
+_FILES = {
+    "scene": ("scene",),
+    "robot": ("robot",),
+    "target": ("scene", "robot"),
+    "controller": ("tuning",),
+    "start": ("tuning",),
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; return the exit status: 1 for a failure, 130 for Ctrl-C."""
+    with interrupt.listening(to_the_end=arguments is None):
+        try:
+            status = _run(parser().parse_args(arguments))
+            sys.stdout.flush()
+            return status
+        except BrokenPipeError:  # of `pcr-mpc ... | head`: nobody reads on, which is no failure to report
+            for stream in (sys.__stdout__, sys.__stderr__):
+                if stream is not None:
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+            return 128 + 13  # SIGPIPE
+
+
+def _run(options: argparse.Namespace) -> int:
+    try:
+        warnings.formatwarning = lambda message, *_, **__: f"pcr-mpc: warning: {message}\n"
+        _check(options)
+        with interrupt.nothing_to_lose():
+            module, name = options.run
+            command = getattr(importlib.import_module(f"{__package__}.{module}"), name)
+        status: int = command(options)
+        sys.stdout.flush()
+        interrupt.check()
+        return status
+    except BrokenPipeError:
+        raise
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error.__cause__, BrokenPipeError):
+            raise BrokenPipeError from error
+        stopped = interrupt.noted() or KeyboardInterrupt in (type(error), type(error.__cause__))
+        if options.traceback:
+            traceback.print_exc()
+        print(f"pcr-mpc: {_message(error, stopped)}", file=sys.stderr)
+        return interrupt.exit_status() if stopped else 1
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Find the commonest errors before anything that takes time is loaded."""
+    for name, least in LEAST.items():
+        if (value := getattr(options, name, None)) is not None and value < least:
+            raise ValueError(f"--{name} is {value}, expected at least {least}")
+    with interrupt.nothing_to_lose():
+        from ..toml_table import read_toml
+
+        options.named = []
+        for name, kinds in _FILES.items():
+            given = getattr(options, name, None)
+            if given and not (name == "controller" and isinstance(given, str)):  # else the name of a class
+                path, by_name = _found(str(given), kinds)
+                read_toml(path)
+                setattr(options, name, path)
+                options.named += [name] if by_name else []
+
+
+def _found(given: str, kinds: tuple[str, ...]) -> tuple[Path, bool]:
+    """File that is meant by a path or a name, and whether it is by a name that it comes with the package."""
+    from ..catalogue import is_name, kinds_of, nearest, shipped
+
+    if not is_name(given):
+        return Path(given), False
+    kind = next((one for one in kinds_of(given) if one in kinds), None)
+    if kind is None and Path(given).is_file():
+        return Path(given), False
+    return shipped(given, kind or next((one for one in kinds if nearest(given, one)), kinds[0])), True
+
+
+def _message(error: BaseException, stopped: bool) -> str:
+    from ..errors import PCRError, SimulationError, described  # which load NumPy
+
+    if stopped:
+        return str(error) if isinstance(error, KeyboardInterrupt | SimulationError) and str(error) else "interrupted"
+    if isinstance(error, MemoryError):
+        return f"out of memory: {error}".rstrip(": ")
+    if isinstance(error, PCRError | ValueError | OSError):
+        return described(error)
+    return f"{type(error).__name__}: {error}; --traceback shows where"

@@ -1,0 +1,98 @@
+"""The commands of the command line that begin with somebody's own robot: make one, and examine it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from ..design.examination import Examination, examine
+from ..design.sizing import Design, design
+from ..design.toml_text import files
+from ..design.wish import Wish
+from ..errors import InfeasibleError, ModelError, PCRError
+from ..files import require_absent, require_free, write_text
+from ..loop.demand.feasibility import check_scene
+from ..loop.scene.file import load_scene
+from ..plant.robot import load_robot
+from ..report.check_tables import check_record, check_table
+from ..report.new_table import new_record, new_table
+from ..toml_table import read_toml
+
+_SLOWER = 1.25  # by which a lap is made longer until the reference keeps every limit
+_ATTEMPTS = 12
+_NAMES = ("robot.toml", "scene.toml", "tuning.toml")
+
+
+def new(options: argparse.Namespace) -> int:
+    """Run `pcr-mpc new`."""
+    folder = options.folder
+    wish = Wish(
+        folder.resolve().name, options.rods, options.material, options.diameter, options.length, options.spacing,
+        options.tip_mass, options.motor,
+    )  # fmt: skip
+    # Rather now than after the search.
+    require_absent((folder / name for name in _NAMES), force=options.overwrite)
+    chosen = _kept(design(wish))
+    for name, text in files(chosen).items():
+        write_text(folder / name, text)
+    found = examine(load_scene(folder / "scene.toml"), modes=False)
+    written = {name: str(folder / name) for name in _NAMES}
+    print(json.dumps(new_record(chosen, found, written)) if options.json else new_table(chosen, found))
+    scene = folder / "scene.toml"
+    print(f"\nwritten to {folder}; next: pcr-mpc check {scene}, pcr-mpc track {scene}", file=sys.stderr)
+    return _verdict(found)
+
+
+def _kept(chosen: Design) -> Design:
+    """The design with a lap so slow that its reference keeps every limit.
+
+    Raises
+    ------
+    InfeasibleError
+        Slowness does not help.
+    """
+    with tempfile.TemporaryDirectory(prefix="pcr-mpc-") as place:
+        for _ in range(_ATTEMPTS):
+            for name, text in files(chosen).items():
+                write_text(Path(place) / name, text)
+            try:
+                excess = check_scene(load_scene(Path(place) / "scene.toml"))
+            except ModelError:
+                raise
+            except PCRError as error:
+                excess = [str(error)]
+            if not excess:
+                return chosen
+            chosen = replace(chosen, lap=float(f"{_SLOWER * chosen.lap:.2g}"))
+    raise InfeasibleError(
+        f"{chosen.wish.name}: the path cannot be followed however slowly: {excess[0]}; take other numbers of the rods",
+        limit="reference",
+    )
+
+
+def check(options: argparse.Namespace) -> int:
+    """Run `pcr-mpc check`."""
+    if options.picture:
+        require_free(options.picture, force=options.overwrite)
+    is_robot = read_toml(options.target).has("rods")
+    found = examine(load_robot(options.target) if is_robot else load_scene(options.target))
+    print(json.dumps(check_record(found)) if options.json else check_table(found))
+    if options.picture:
+        from ..report.check_picture import plot_check
+
+        plot_check(found, options.picture)
+        print(f"drawn in {options.picture}", file=sys.stderr)
+    return _verdict(found)
+
+
+def _verdict(found: Examination) -> int:
+    """Exit status of what can run as asked; raises for what cannot."""
+    if found.errors:
+        more = f" (and {len(found.errors) - 1} more)" if len(found.errors) > 1 else ""
+        asked = "cannot be held" if found.scene is None else "cannot run as asked"
+        raise ModelError(f"{found.name} {asked}: {found.errors[0].text}{more}", key=found.errors[0].about)
+    return 0

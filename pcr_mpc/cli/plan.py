@@ -1,0 +1,60 @@
+"""The command of the command line that plans."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+
+from ..design.examination import moving_mass
+from ..errors import OutputError
+from ..files import require_free, saved, stamped, write_text
+from ..loop.scene.file import load_scene
+from ..report.planning import plan_table, plot_plan
+from ..study.planning.limits import PlanLimits
+from ..study.planning.plan import plan_timing
+
+
+def plan(options: argparse.Namespace) -> int:
+    """Run `pcr-mpc plan`."""
+    scene = load_scene(options.scene)
+    out = options.out or Path("results") / "plan" / f"{scene.name}.csv"
+    picture = None if options.no_pictures else out.with_suffix(".png")
+    for path in (out, picture):
+        if path is not None:
+            require_free(path, force=options.overwrite)
+    more = {
+        name: math.inf if value is None else value
+        for name, value in vars(options).items()
+        if name in ("tip_speed", "tip_acceleration", "tip_jerk")
+    }
+    begin = time.perf_counter()
+    planned = plan_timing(
+        scene,
+        limits=PlanLimits.of_scene(scene, **more),
+        tolerance=1e-3 * options.tolerance,
+        cells=options.cells,
+        free=options.free,
+        progress=True,
+    )
+    share = moving_mass(scene.start())[1]
+    summary = planned.summary() | {"share_of_rods": share, "planning_s": time.perf_counter() - begin}
+
+    def write(folder: Path) -> None:
+        write_text(folder / out.name, stamped(planned.csv()))
+        if picture is not None:
+            plot_plan(planned, folder / picture.name)
+
+    folder, problem = saved(write, out.parent)
+    names = [out.name] if picture is None else [out.name, picture.name]
+    summary["files"] = {name: str(folder / name) for name in names}
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        print(f"\n{plan_table(summary)}\n\nwritten to {folder / out.name}; to track it, put into a scene:")
+        print(f'[reference]\nkind = "file"\nfile = "{folder / out.name}"')
+    if problem:
+        raise OutputError(problem, path=str(folder))
+    return 0

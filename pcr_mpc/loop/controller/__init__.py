@@ -1,0 +1,1 @@
+"""Controllers of a scene, and of a robot that follows a path."""

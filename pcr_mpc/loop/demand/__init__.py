@@ -1,0 +1,1 @@
+"""What a reference asks of the robot: inverse dynamics along it, and whether the robot can."""

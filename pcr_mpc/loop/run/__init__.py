@@ -1,0 +1,1 @@
+"""The closed loop: a controller drives a plant; its record, limits and figures."""

@@ -1,0 +1,1 @@
+"""Which robot does what, for how long, simulated how: scenes, their parts and their files."""
