@@ -90,14 +90,7 @@ class BufferedFunction:
     """
 
     def __init__(self, function: Any) -> None:
-        if not (_all_dense(function.sparsity_in, function.n_in())
-                and _all_dense(function.sparsity_out, function.n_out())):  # fmt: skip
-            with BUILDING:
-                symbol = ca.SX if function.is_a("SXFunction") else ca.MX
-                arguments = [symbol.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
-                results = [ca.densify(result) for result in function.call(arguments)]
-                function = ca.Function(function.name(), arguments, results)
-        self.function = function
+        self.function = function = dense(function)
         self.memory_in, of_inputs = _memory([function.size_in(i) for i in range(function.n_in())])
         self.memory_out, of_outputs = _memory([function.size_out(i) for i in range(function.n_out())])
         # The buffer object owns the work memory: losing it while `_trigger` lives is a segfault.
@@ -118,6 +111,17 @@ class BufferedFunction:
             f"the graph {self.function.name()!r} writes into memory of its own, and can be neither pickled nor copied: "
             "pickle the plant, controller or model that it belongs to, or make that anew"
         )
+
+
+@building
+def dense(function: Any) -> Any:
+    """Return the same function with all its arguments and results dense; itself if they are."""
+    if _all_dense(function.sparsity_in, function.n_in()) and _all_dense(function.sparsity_out, function.n_out()):
+        return function
+    symbol = ca.SX if function.is_a("SXFunction") else ca.MX
+    arguments = [symbol.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
+    results = [ca.densify(result) for result in function.call(arguments)]
+    return ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
 
 
 def _all_dense(sparsity: Any, count: int) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from .errors import ReadOnlyError
 
 C = TypeVar("C", bound=type)
+T = TypeVar("T")
 
 
 class Frozen:
@@ -24,6 +25,16 @@ class Frozen:
         for value in self.__dict__.values():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
+
+
+def made(kind: type[T], fields: dict[str, Any]) -> T:
+    """Make a frozen dataclass of all its fields, unchecked, in a fifth of the time: for the control step.
+
+    ``fields`` become the new object's own.
+    """
+    new = object.__new__(kind)
+    object.__setattr__(new, "__dict__", fields)
+    return new
 
 
 def read_only(array: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import CompilerError, PCRError, Plant
+from pcr_mpc.buffered import BufferedFunction
 from pcr_mpc.compiled import compiled, fastest, has_compiler
 from pcr_mpc.plant.rods.elastica import rod_newton
 
@@ -70,6 +71,7 @@ def test_built_once_and_said_so(folder, capfd):
 
 SCRIPT = """
 import casadi as ca
+from pcr_mpc.buffered import BufferedFunction
 from pcr_mpc.compiled import compiled
 x = ca.SX.sym("x", 2)
 print(*compiled(ca.Function("small", [x], [2.0 * ca.sin(x) / (1 + x[0] ** 2)]))([0.3, -0.7]).full().ravel())
@@ -317,6 +319,20 @@ def test_a_compiler_that_fails_is_an_error_with_what_it_said(folder, monkeypatch
     assert isinstance(error, PCRError)
     assert error.command == [str(broken)]
     assert "set CC" in str(error)
+
+
+def test_machine_code_is_dense_whatever_the_graph_is(folder):
+    """Else each call goes through what makes it dense, interpreted; names and numbers stay."""
+    x = ca.SX.sym("x", 3)
+    sparse = ca.Function("diagonal", [x], [ca.diag(x), x[0]], ["x"], ["square", "first"])
+    code = fastest(sparse)
+    assert code.name_out() == ["square", "first"]
+    assert code.sparsity_out(0).is_dense()
+    buffered = BufferedFunction(code)
+    assert buffered.function is code
+    buffered.inputs[0][:] = 1.0, 2.0, 3.0
+    buffered()
+    np.testing.assert_array_equal(buffered.outputs[0], np.diag([1.0, 2.0, 3.0]))
 
 
 def test_nothing_is_compiled_by_default(pair):

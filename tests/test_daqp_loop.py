@@ -113,9 +113,9 @@ def test_the_closed_loop_is_that_of_osqp(name, monkeypatch):
     seen = []
 
     class Recorded(DAQPSolver):
-        def update(self, *arguments, **options):
-            self.given = [np.array(each) for each in arguments]  # they are overwritten
-            super().update(*arguments, **options)
+        def answer(self, problem, *arguments, **options):
+            self.given = [np.array(each) for each in problem]  # they are overwritten
+            return super().answer(problem, *arguments, **options)
 
         def judge(self, solution):
             super().judge(solution)

@@ -241,6 +241,14 @@ def test_a_plan_is_a_prediction_by_its_models(tuning, target, model, reference, 
             array[:] = 0.0
 
 
+def test_models_of_a_graph_predict_as_a_model_does(target, model):
+    later = replace(model, A=1.1 * model.A, c=model.c + 0.3)
+    models, x, u = LinearModels.of([model, later]), off(target), np.array([0.7, -0.4])
+    for k, one in enumerate((model, later)):
+        assert models.moved(k, x, u) == pytest.approx(one(x, u), rel=1e-14)
+        np.testing.assert_array_equal(models.moved(k, x, u), models[k](x, u))
+
+
 def test_a_fall_back_predicts_too_where_it_can(tuning, target, model, reference, wide):
     mpc = LinearMPC(tuning, wide)
     mpc.solve(off(target), model, reference, NONE)

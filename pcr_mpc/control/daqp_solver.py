@@ -11,7 +11,6 @@ answer (residuals are computed from the data, and decide).
 
 from __future__ import annotations
 
-import math
 import time
 
 import daqp
@@ -168,27 +167,14 @@ class DAQPSolver(CheckedQP):
         )
         self._prices = prices
 
-    def solve(self, most: int | None = None, *, certified: bool = True) -> Solution:
-        """Solve the current data, in at most ``most`` iterations if that is less than ``max_iterations``.
-
-        Unless it is to be ``certified``, the residuals are left to the caller, who must `judge` by them.
-
-        Raises
-        ------
-        ValueError
-            There are no data yet.
-        InfeasibleError
-            DAQP's status is anything but "solved", or a residual misses the tolerance; ``status`` says what,
-            ``iterations`` how far it got, ``limit`` which row would have to give most if the problem is infeasible.
-        """
-        allowed = self._allowed_of(most)
-        if allowed != self._allowed:
-            self._model.settings = {"iter_limit": allowed + 1}
-            self._allowed = allowed
+    def _solve_into(self, x: np.ndarray, y: np.ndarray, most: int) -> tuple[int, float]:
+        if most != self._allowed:
+            self._model.settings = {"iter_limit": most + 1}
+            self._allowed = most
         began = time.perf_counter()
         if self._flag == 0:
             core, _, flag, info = self._model.solve()
-            iterations = min(int(info["iterations"]), allowed)
+            iterations = min(int(info["iterations"]), most)
         else:
             flag, iterations = self._flag, 0
         spent = self._spent + time.perf_counter() - began
@@ -196,15 +182,11 @@ class DAQPSolver(CheckedQP):
             self._forget()
             status = "primal infeasible" if flag in _INFEASIBLE else _STATUS.get(flag, f"DAQP's exit {flag}")
             raise self._unsolved(status, iterations, spent, self._worst_row() if flag in _INFEASIBLE else None)
-        x, y = self._whole(core, info["lam"])
-        if not certified:
-            return Solution(x, y, iterations, spent, math.nan, math.nan)
-        solution = Solution(x, y, iterations, spent, *self._residuals(x, y))
-        self.judge(solution)
-        return solution
+        self._whole(core, info["lam"], x, y)
+        return iterations, spent
 
     def judge(self, solution: Solution) -> None:
-        """Accept a solution by its residuals, or raise `InfeasibleError`."""
+        """Accept a solution whose residuals do not miss the tolerance, or raise `InfeasibleError`."""
         x, y, iterations, spent, primal, dual = solution
         # So written that NaN is not accepted.
         if not max(primal, dual) <= self._tolerance and not self._accepted(x, y, primal, dual):
@@ -217,20 +199,21 @@ class DAQPSolver(CheckedQP):
         self._y = np.zeros(self._rows)
         self._flag = self._model.update(sense=self._senses())
 
-    def _whole(self, core: np.ndarray, multipliers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """x and y with the slacks and their multipliers."""
-        if not self._soft:
-            return core, multipliers
+    def _whole(self, core: np.ndarray, multipliers: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+        """Write x and y with the slacks and their multipliers."""
+        rows, columns, soft = self._rows, self._columns, self._soft
+        x[:columns], y[:rows] = core, multipliers
+        if not soft:
+            return
         assert self._data is not None
         _, q, lower, upper = self._data
-        rows, soft = self._rows, self._soft
         value = self._core[rows - soft :] @ core
         gives = self._sense[rows - soft :] == _SOFT
         under = np.where(gives, np.maximum(lower[rows - soft : rows] - value, 0.0), 0.0)
         over = np.where(gives, np.maximum(value - upper[rows - soft : rows], 0.0), 0.0)
-        slacks, tied = np.concatenate([under, over]), multipliers[rows - soft :]
-        rest = -(slacks + q[self._columns :] + np.concatenate([tied, -tied]))
-        return np.concatenate([core, slacks]), np.concatenate([multipliers, rest])
+        x[columns:] = slacks = np.concatenate([under, over])
+        tied = multipliers[rows - soft :]
+        y[rows:] = -(slacks + q[columns:] + np.concatenate([tied, -tied]))
 
     def _accepted(self, x: np.ndarray, y: np.ndarray, primal: float, dual: float) -> bool:
         """Whether the residuals are within the tolerance relative to what they are differences of, as OSQP judges."""

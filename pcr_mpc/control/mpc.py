@@ -218,21 +218,12 @@ class LinearMPC:
                 states = self._workspace.check.states(x, models, inputs)
         self._age = 0
         solution = answer.solution
-        self._last = Plan.found(
-            inputs=inputs,
-            states=states,
-            models=models.copy() if told is None else told,
-            status=status,
-            fallback=fallback,
-            active=answer.active,
-            slack=answer.slack,
-            iterations=solution.iterations,
-            primal_residual=solution.primal_residual,
-            dual_residual=solution.dual_residual,
-            update_time=updated - began,
-            solve_time=solved - updated,
-            solver_time=solution.run_time,
-        )
+        self._last = Plan.found({
+            "inputs": inputs, "states": states, "models": models.copy() if told is None else told, "status": status,
+            "fallback": fallback, "active": answer.active, "slack": answer.slack, "iterations": solution.iterations,
+            "primal_residual": solution.primal_residual, "dual_residual": solution.dual_residual,
+            "update_time": updated - began, "solve_time": solved - updated, "solver_time": solution.run_time,
+        })  # fmt: skip
         return self._last
 
     def _continues(self, limits: Limits, hessian: float, gradient: float) -> bool:

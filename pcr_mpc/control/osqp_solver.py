@@ -7,11 +7,13 @@ checked before it is handed over, every return code is read, and x exists only i
 
 from __future__ import annotations
 
+from typing import NoReturn
+
 import numpy as np
 import osqp
 import scipy.sparse as sp
 
-from .qp_solver import CheckedQP, Solution
+from .qp_solver import CheckedQP
 
 _RHO = 0.1
 _SOLVED = int(osqp.SolverStatus.OSQP_SOLVED)
@@ -70,7 +72,8 @@ class QPSolver(CheckedQP):
         self._osqp.setup(hessian, np.zeros(n), self._matrix, -np.ones(m), np.ones(m), **self._settings)
 
     def _start_from(self, x: np.ndarray, y: np.ndarray | None) -> None:
-        self._require(self._core.warm_start(x, y), "warm_start")
+        if code := self._core.warm_start(x, y):
+            self._refused("warm_start", code)
 
     def _hand_over(
         self,
@@ -85,26 +88,14 @@ class QPSolver(CheckedQP):
             # OSQP keeps the refused P, and would say "solved" of a mixture.
             self.reset()
             raise self._not_convex("P has a negative eigenvalue")
-        self._require(core.update_data_vec(q, l, u), "update_data_vec")
+        if code := core.update_data_vec(q, l, u):
+            self._refused("update_data_vec", code)
 
-    def solve(self, most: int | None = None, *, certified: bool = True) -> Solution:
-        """Solve the current data, in at most ``most`` iterations if that is less than ``max_iterations``.
-
-        Unless it is to be ``certified``, the residuals are left to the caller: NaN.
-
-        Raises
-        ------
-        ValueError
-            There are no data yet.
-        InfeasibleError
-            OSQP's status is anything but "solved"; ``status`` says what, ``iterations`` how far it got, ``limit``
-            which row stands most in the way if the problem is infeasible.
-        """
+    def _solve_into(self, x: np.ndarray, y: np.ndarray, most: int) -> tuple[int, float]:
         core = self._core
-        allowed = self._allowed_of(most)
-        if allowed != self._allowed:
-            self._osqp.update_settings(max_iter=allowed)
-            self._allowed = allowed
+        if most != self._allowed:
+            self._osqp.update_settings(max_iter=most)
+            self._allowed = most
         core.solve()
         info = core.info
         if info.status_val != _SOLVED:
@@ -113,15 +104,13 @@ class QPSolver(CheckedQP):
                 # The row that weighs most in the proof that no point meets all bounds.
                 limit = int(np.argmax(np.abs(core.solution.prim_inf_cert)))
             # An unsolved problem's iterate and step size must not start the next one.
-            self._require(core.warm_start(np.zeros(self.n), np.zeros(self.m)), "warm_start")
+            self._start_from(np.zeros(self.n), np.zeros(self.m))
             self._osqp.update_settings(rho=self._settings["rho"])
             raise self._unsolved(status, iterations, float(info.run_time), limit)
         found = core.solution
-        x, y = np.array(found.x), np.array(found.y)
-        primal, dual = self._residuals(x, y) if certified else (np.nan, np.nan)
-        return Solution(x, y, info.iter, info.run_time, primal, dual)
+        x[:], y[:] = found.x, found.y
+        return info.iter, info.run_time
 
     @staticmethod
-    def _require(code: int | None, call: str) -> None:
-        if code:
-            raise RuntimeError(f"OSQP refused {call} with code {code}; the old data are still in place")
+    def _refused(call: str, code: int) -> NoReturn:
+        raise RuntimeError(f"OSQP refused {call} with code {code}; the old data are still in place")

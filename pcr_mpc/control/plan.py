@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..frozen import Frozen
+from ..frozen import Frozen, made
 from ..linearisation.linear_model import LinearModel
 
 # From the best answer to the last resort.
@@ -58,14 +58,12 @@ class Plan(Frozen):
     solver_time: float = 0.0
 
     @classmethod
-    def found(cls, **fields: Any) -> Plan:
-        """A plan with all its fields given, in a third of the time: for the control step."""
-        plan = object.__new__(cls)
-        plan.__dict__.update(fields)
-        for name in ("inputs", "states"):
-            if (array := fields[name]) is not None:
-                array.flags.writeable = False
-        return plan
+    def found(cls, fields: dict[str, Any]) -> Plan:
+        """A plan with all its fields given, in a fifth of the time: for the control step."""
+        fields["inputs"].setflags(write=False)
+        if fields["states"] is not None:
+            fields["states"].setflags(write=False)
+        return made(cls, fields)
 
     def spanning(self, horizon: int) -> Plan:
         """Return its rates over another horizon, the last ones held beyond its end; nothing else of it."""

@@ -64,6 +64,11 @@ class QuadraticProgram:
     sizes: np.ndarray = field(default_factory=lambda: np.array([np.nan, np.nan, 0.0]))
     block: np.ndarray | None = None
 
+    @property
+    def sound(self) -> bool:
+        """Whether the graph that made the data has found them finite, and no bounds to cross."""
+        return bool(self.sizes[2] > 0.0)
+
 
 def build_qp(
     x: np.ndarray,

@@ -74,11 +74,8 @@ class CheckedQP(ABC):
     def _set_up(self) -> None:
         """Make a new workspace for the dense A."""
 
-    @abstractmethod
-    def solve(self, most: int | None = None, *, certified: bool = True) -> Solution:
+    def solve(self, most: int | None = None) -> Solution:
         """Solve the current data, in at most ``most`` iterations if that is less than ``max_iterations``.
-
-        Unless it is to be ``certified``, the residuals are left to the caller: they are NaN, and `judge` wants them.
 
         Raises
         ------
@@ -87,6 +84,61 @@ class CheckedQP(ABC):
         InfeasibleError
             The solver's status is anything but "solved"; ``status`` says what, ``iterations`` how far it got,
             ``limit`` which row stands most in the way if the problem is infeasible.
+        """
+        if self._data is None:
+            raise ValueError("there is no QP to solve: call update first")
+        x, y = np.empty(self.n), np.empty(self.m)
+        found = self._solve_into(x, y, self._most if most is None else max(1, min(most, self._most)))
+        solution = Solution(x, y, *found, *self._residuals(x, y))
+        self.judge(solution)
+        return solution
+
+    def answer(
+        self,
+        problem: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        start: np.ndarray | None,
+        x: np.ndarray,
+        y: np.ndarray,
+        *,
+        sound: bool,
+    ) -> tuple[int, float]:
+        """Update, start warm and solve in one go.
+
+        Parameters
+        ----------
+        problem : tuple of ndarray
+            P, q, l and u as for `update`.
+        sound : bool
+            The graph that made the problem has checked it, and it stays as it is until the next one.
+        start : ndarray, shape (n,), or None
+            From a solution; the multipliers are the last ones.
+        x, y : ndarray, shapes (n,) and (m,)
+            The solution is written there. Its residuals are left to the caller, who lets `judge` see them.
+
+        Returns
+        -------
+        (int, float)
+            Iterations, and seconds inside the solver.
+
+        Raises
+        ------
+        ValueError, InfeasibleError
+            As `update` and `solve`.
+        """
+        if sound:
+            self._hand_over(*problem, None)
+            self._data = problem
+        else:
+            self.update(*problem)
+        if start is not None:
+            self._start_from(start, None)
+        return self._solve_into(x, y, self._most)
+
+    @abstractmethod
+    def _solve_into(self, x: np.ndarray, y: np.ndarray, most: int) -> tuple[int, float]:
+        """Solve the data that were handed over in at most so many iterations; return these, and seconds inside.
+
+        Raises `InfeasibleError` for every status but "solved".
         """
 
     @abstractmethod
@@ -105,16 +157,10 @@ class CheckedQP(ABC):
         """Give a checked start to the solver."""
 
     def judge(self, solution: Solution) -> None:  # noqa: B027  most solvers have judged themselves
-        """Accept a solution whose residuals the caller has computed, or raise `InfeasibleError`."""
+        """Accept a solution by its residuals, or raise `InfeasibleError`."""
 
-    def warm_start(self, x: np.ndarray, y: np.ndarray | None = None, *, sound: bool = False) -> None:
-        """Start the next solve from x, shape (n,), and multipliers y, shape (m,); None keeps the last ones.
-
-        ``sound``: x comes from a solution, and is not checked.
-        """
-        if sound and y is None:
-            self._start_from(x, None)
-            return
+    def warm_start(self, x: np.ndarray, y: np.ndarray | None = None) -> None:
+        """Start the next solve from x, shape (n,), and multipliers y, shape (m,); None keeps the last ones."""
         y = None if y is None else _checked("y", y, self.m)
         self._start_from(_checked("x", x, self.n), y)
 
@@ -125,8 +171,6 @@ class CheckedQP(ABC):
         l: np.ndarray,  # noqa: E741
         u: np.ndarray,
         A: np.ndarray | None = None,
-        *,
-        sound: bool = False,
     ) -> None:
         """Replace the data.
 
@@ -139,8 +183,6 @@ class CheckedQP(ABC):
             Bounds; infinite entries are allowed.
         A : ndarray, shape (stored entries of A,), optional
             Column by column, in the order of the first A. None: as they are.
-        sound : bool
-            The graph that made P, q, l and u has checked them; they stay as they are until the next update.
 
         Raises
         ------
@@ -150,10 +192,6 @@ class CheckedQP(ABC):
             Some bounds cross; ``limit`` is the row, and the old data stay. Or P is not convex: then the old data are
             lost, and good ones are needed before it solves again.
         """
-        if sound and P is not None and A is None:
-            self._hand_over(P, q, l, u, None)
-            self._data = P, q, l, u
-            return
         q = _checked("q", q, self.n)
         if (P is None) != self._identity:
             raise ValueError("P is the identity of this solver" if self._identity else "P is missing")
@@ -173,11 +211,6 @@ class CheckedQP(ABC):
             self._dense_a.ravel()[self._entries] = A
         self._hand_over(P, q, l, u, A)
         self._data = P, q, l, u
-
-    def _allowed_of(self, most: int | None) -> int:
-        if self._data is None:
-            raise ValueError("there is no QP to solve: call update first")
-        return self._most if most is None else max(1, min(most, self._most))
 
     def _not_convex(self, what: str) -> InfeasibleError:
         return InfeasibleError(

@@ -80,31 +80,39 @@ class Workspace:
         whole is solved at once.
         """
         self._spent, self._inside = 0, 0.0
-        check, solver = self.check.loaded(qp, x, models, limits), self._rates_only
         if not self._limits_matter:
-            rate, plain = self._rate, self._rate == 1.0
+            check, rate, solver = self.check.loaded(qp, x, models, limits), self._rate, self._rates_only
+            at, y, problem, start = check.rates, check.y, check.problem, warm
+            if rate != 1.0:
+                at, y, problem = np.empty_like(at), np.empty_like(y), check.scaled(rate)
+                start = None if warm is None else warm / rate
             try:
-                solver.update(*check.problem(rate), sound=qp.sizes[2] > 0.0)
-                if warm is not None:
-                    solver.warm_start(warm if plain else warm / rate, sound=True)
-                found = solver.solve(certified=False)
-                inputs, y = (found.x, found.y) if plain else (rate * found.x, found.y / rate)
-                primal, dual, broken, of_rates, of_changes, kept = check(inputs, y)
-                found = Solution(found.x, found.y, found.iterations, found.run_time, primal / rate, rate * dual)
-                solver.judge(found)
+                spent, inside = solver.answer(problem, start, at, y, sound=qp.sound)
+                if rate != 1.0:
+                    check.rates[:], check.y[:] = rate * at, y / rate
+                else:
+                    at, y = at.copy(), y.copy()
+                primal, dual, broken, of_rates, of_changes, kept = check()
+                solution = Solution(at, y, spent, inside, primal / rate, rate * dual)
+                solver.judge(solution)
             except InfeasibleError as error:
                 self._count(error)
             else:
-                states, solution = check.states(), found if plain else found._replace(x=inputs, y=y)
+                states, inputs = check.states(), at
+                if rate != 1.0:
+                    inputs = check.rates.copy()
+                    solution = solution._replace(x=inputs, y=check.y.copy())
                 if pose_limits is not None:
                     rows = states[1:] @ pose_limits.C.T
                     broken = max(
                         broken, float((pose_limits.lower - rows).max()), float((rows - pose_limits.upper).max())
                     )
                 if broken <= self._tuning.tolerance * rate * self.dt:
-                    active = active_of({_RATES[0]: rate * of_rates, _RATES[1]: rate * of_changes})
+                    active: tuple[str, ...] = ()
+                    if of_rates or of_changes:
+                        active = active_of({_RATES[0]: rate * of_rates, _RATES[1]: rate * of_changes})
                     return Limited(inputs, states, kept > 0.0, {}, active, solution)
-                self._spent, self._inside, warm = solution.iterations, solution.run_time, inputs
+                self._spent, self._inside, warm = spent, inside, inputs
         return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
 
     def soften(
@@ -173,7 +181,7 @@ class Check:
         return self._for(models).predict(x, models, inputs)
 
     def _for(self, models: LinearModels) -> Loaded:
-        count = len(models)
+        count = models.columns.shape[1]
         if count not in self._loaded:
             graph = fastest(checking(self._horizon, self._n, count), self._compiled)
             self._loaded[count] = Loaded(BufferedFunction(graph))
@@ -181,17 +189,25 @@ class Check:
 
 
 class Loaded:
-    """The graph of a `Check` and its memory, in which a problem lies as long as no other is loaded."""
+    """The graph of a `Check` and its memory, in which a problem lies as long as no other is loaded.
+
+    Attributes
+    ----------
+    problem : tuple of ndarray
+        P, q, and the bounds of rates and changes.
+    rates, y : ndarray
+        Where an answer is to be written: inputs, and multipliers of rates and changes.
+    """
 
     def __init__(self, graph: BufferedFunction) -> None:
         self._graph = graph
-        self._models, self._x, *parts, self._bounds, self._dt, self._clear, rates, self._y = graph.inputs
+        self._models, self._x, *parts, self._bounds, self._dt, self._clear, rates, self.y = graph.inputs
         self._parts = p, q, lower, upper = parts
         self._block = graph.memory_in[: sum(view.size for view in (self._models, self._x, *parts))]
-        self._rates = rates.T.reshape(-1)
+        self.rates: np.ndarray = rates.T.reshape(-1)
         self._states, self._numbers = graph.outputs[0].T, graph.outputs[1]
         self._limits: Limits | None = None
-        self._problem = p, q, lower[: len(self._y)], upper[: len(self._y)]
+        self.problem = p, q, lower[: len(self.y)], upper[: len(self.y)]
 
     def load(self, qp: QuadraticProgram, x: np.ndarray, models: LinearModels, limits: Limits) -> None:
         """Take over a problem, in one copy where it is one block."""
@@ -205,19 +221,18 @@ class Loaded:
             self._limits, self._bounds[:], self._clear[:] = limits, motor_bounds(limits), limits.clear
             self._dt[:] = models.dt
 
-    def problem(self, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """P, q, and the bounds of rates and changes, for rates in this unit [rad/s]; where it is one, as they lie."""
-        p, q, lower, upper = self._problem
-        return self._problem if rate == 1.0 else (rate**2 * p, rate * q, lower / rate, upper / rate)
+    def scaled(self, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The problem for rates in this unit [rad/s]."""
+        p, q, lower, upper = self.problem
+        return rate**2 * p, rate * q, lower / rate, upper / rate
 
     def _load_models(self, x: np.ndarray, models: LinearModels) -> None:
         self._models.reshape(models.columns.shape, order="F")[:] = models.columns
         self._x[:], self._dt[:] = x, models.dt
 
-    def __call__(self, inputs: np.ndarray, y: np.ndarray) -> list[float]:
+    def __call__(self) -> list[float]:
         """Residuals of rows and gradient, excess of an angle [rad], the largest multipliers of rates and of changes,
-        and 1 if the first rates keep the limits as they are, of an answer to the problem that was loaded."""
-        self._rates[:], self._y[:] = inputs, y
+        and 1 if the first rates keep the limits as they are, of the answer to the problem that was loaded."""
         self._graph()
         found: list[float] = self._numbers.tolist()
         return found
@@ -229,6 +244,6 @@ class Loaded:
     def predict(self, x: np.ndarray, models: LinearModels, inputs: np.ndarray) -> np.ndarray:
         """States to which other inputs lead from x."""
         self._load_models(x, models)
-        self._rates[:] = inputs.ravel()
+        self.rates[:] = inputs.ravel()
         self._graph()
         return self.states()

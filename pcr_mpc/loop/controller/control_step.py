@@ -17,6 +17,7 @@ from ...control.plan import Plan
 from ...control.qp import Reference
 from ...control.tuning import SAME_ANGLE, Limits
 from ...errors import PCRError, checked_period, measured_vector
+from ...frozen import made
 from ...linearisation.linear_limits import LinearLimits
 from ...linearisation.linear_model import LinearModel, LinearModels
 from ...linearisation.pose_limits import LimitWatch
@@ -158,7 +159,7 @@ class ControlStep:
             try:
                 x = robot.step(x, self.turning, force)
             except PCRError:
-                x = self._predicts[0](x, self.turning)
+                x = self._predicts.moved(0, x, self.turning)
         foresight.expected[:] = x
         self._gate.pass_by(count, x[4:])
 
@@ -218,7 +219,8 @@ class ControlStep:
         foresight.expected[:], foresight.force[:] = here, force
         if self.past is not None:
             self.past.remember(corrected, self._predicts[0])
-        return Decision(u, plan, linearised - began, estimate, force, events)
+        return made(Decision, {"u": u, "plan": plan, "linearise_time": linearised - began, "estimate": estimate,
+                               "force": force, "events": events})  # fmt: skip
 
     def _believe(self, k: int, x: np.ndarray, foresight: Foresight) -> tuple[Event, ...]:
         """Write what is believed of a measurement; what is not is as expected."""
@@ -245,7 +247,7 @@ class ControlStep:
             foresight.force[:] += change[4:]
             found.p = None  # it is done with
         p = expected[:2] if found.p is None else found.p
-        foresight.inputs["measured"][:] = [*p, *(expected[4:] if found.q is None else found.q)]
+        foresight.measured[:] = [*p, *(expected[4:] if found.q is None else found.q)]
         return found.events
 
     def _tell(self, k: int, foresight: Foresight) -> None:
@@ -253,7 +255,7 @@ class ControlStep:
         rows, track = foresight.rows, self.track
         for j, u in enumerate(self.on_the_way):
             rows["on_the_way"][j] = u
-        foresight.inputs["u_previous"][:] = self.u
+        foresight.u_previous[:] = self.u
         foresight.window[:] = track.window(k, self.delay)
         places = foresight.places
         if track.carries:
@@ -296,20 +298,20 @@ class ControlStep:
         self, outlook: Outlook | None, plan: Plan, estimate: np.ndarray, arriving: np.ndarray, *, foreseen: bool
     ) -> np.ndarray:
         """Foresee the state at the next measurement; the plan has ``foreseen`` it if its first rates act at once."""
-        if outlook is not None and self.delay:
-            self._predicts = outlook.now.copy()
-            return outlook.arriving
         if outlook is not None:
-            # A plan may know better than the models that it was asked for with.
-            better = outlook.models.copy() if plan.models is None or plan.fallback else plan.models
-            self._predicts = LinearModels.of([better] if isinstance(better, LinearModel) else better)
-        if self.foresight.inputs["pull"][0] < 1.0:
-            # The plan is of commanded angles, and so are its states and models.
-            if outlook is not None:
+            if self.delay:
+                self._predicts = outlook.now.copy()
+                return outlook.arriving
+            if self.foresight.pull.item() < 1.0:
+                # The plan is of commanded angles, and so are its states and models.
                 self._predicts = outlook.first.copy()
-        elif foreseen and plan.states is not None and not plan.fallback:
-            return np.asarray(plan.states[1])
-        return self._predicts[0](estimate, arriving)
+            else:
+                # A plan may know better than the models that it was asked for with.
+                better = outlook.models.copy() if plan.models is None or plan.fallback else plan.models
+                self._predicts = LinearModels.of([better] if isinstance(better, LinearModel) else better)
+                if foreseen and plan.states is not None and not plan.fallback:
+                    return np.asarray(plan.states[1])
+        return self._predicts.moved(0, estimate, arriving)
 
     def _within_stops(self, plan: Plan, ahead: np.ndarray, foresight: Foresight) -> Plan:
         """The plan, its first rates within the stops for the sum of the commands too: a wrong angle may be measured."""

@@ -89,6 +89,8 @@ class Foresight:
         Of the graph: what a caller writes before a call.
     rows : dict of str to ndarray
         Those of its inputs that have a column for each period or place: views with a row for each.
+    measured, u_previous, pull : ndarray
+        Those of its inputs that are written or read in every period.
     expected, force : ndarray
         State (4 + n) at the next measurement, and force (2) on the tip, as they are estimated: parts of an input.
     window : ndarray, shape (N, 6 + 2n)
@@ -125,6 +127,7 @@ class Foresight:
         self.window = _rows(given["window"])
         self.rows |= {"states": self.window[:, : 4 + n], "inputs": self.window[:, 4 + n : -2]}
         given["end_force"] = self.window[-1, -2:]
+        self.measured, self.u_previous, self.pull = (given[name] for name in ("measured", "u_previous", "pull"))
         self.expected: np.ndarray = given["estimate"][:-2]
         self.force: np.ndarray = given["estimate"][-2:]
         given["dt"][:], given["target_numbers"][:] = period, target.numbers
