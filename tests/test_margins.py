@@ -10,10 +10,12 @@ from pcr_mpc.errors import MarginsError
 from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.references.trajectory import Hold
+from pcr_mpc.report.margins import margins_table, plot_margins
 from pcr_mpc.study.margins.linear_loop import LinearLoop
 from pcr_mpc.study.margins.measured import PushTest, held_scene, measure_delay_margin, push_dies_away
 from pcr_mpc.study.margins.poses import LinearLoops, scaled, scaled_scene
 from pcr_mpc.study.margins.predicted import _classical, delay_margin, predict_delay_margin
+from pcr_mpc.study.margins.side_by_side import compare_margins
 
 from .conftest import CONTROLLERS, MODELS
 
@@ -51,11 +53,11 @@ def deviations(scene, tuning, size):
 
 
 def linear_response(loop: LinearLoop, size: float, count: int) -> np.ndarray:
-    closed = loop.closed()
-    state = np.zeros(len(closed.A))
+    state = np.zeros(len(loop.transition()))
     state[2:4] = size * PUSH
     found = []
-    for _ in range(count):
+    for k in range(count):
+        closed = loop.closed(k % loop.cycle)
         found.append(np.concatenate([state[:2], closed.C @ state]))
         state = closed.A @ state
     return np.array(found)
@@ -93,6 +95,43 @@ def test_from_commanded_angles_too(holding):
     found = deviations(holding, tuning, 1e-3)
     said = linear_response(loop, 1e-3, len(found))
     assert (np.abs(found - said).max(axis=0) < 6e-3 * np.abs(said).max(axis=0)).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "angles", "camera", "known"),
+    [
+        ("default", "commanded", Camera(latency=0.027, every=2), 0.023),
+        ("default", "measured", Camera(latency=0.013), 0.0),
+        pytest.param("default", "measured", Camera(latency=0.013, every=3), 0.02, marks=pytest.mark.slow),
+        pytest.param("pd", "measured", Camera(every=2), 0.0, marks=pytest.mark.slow),
+    ],
+)
+def test_with_pictures_that_come_late_and_rarely_too(holding, name, angles, camera, known):
+    """Known to be late or not, by the time that they are or by another: the loop is that of the periods in turn."""
+    tuning = tuning_of(name)
+    tuning = replace(
+        tuning, model=replace(tuning.model, angles=angles), observer=replace(tuning.observer, latency=known)
+    )
+    scene = replace(holding, camera=camera)
+    loop = LinearLoops(scene, tuning, poses=1).all()[0]
+    assert loop.cycle == camera.every
+    found = deviations(scene, tuning, 1e-3)
+    said = linear_response(loop, 1e-3, len(found))
+    assert (np.abs(found - said).max(axis=0) < 6e-3 * np.abs(said).max(axis=0)).all()
+    # What the camera does is no small matter.
+    without = linear_response(LinearLoops(holding, tuning, poses=1).all()[0], 1e-3, len(found))
+    assert np.abs(without - said).max() > 0.05 * np.abs(said).max()
+
+
+def test_a_loop_that_measures_in_some_periods_has_no_gain_at_one_frequency(holding, tmp_path):
+    rare = replace(holding, camera=Camera(every=2))
+    predicted, summary = compare_margins(rare, tuning_of("default"), poses=1, measure=False)
+    margins = summary["margins"]
+    assert not {"gain_margin", "phase_margin_deg", "sensitivity_peak"} & set(margins)
+    assert 0.0 < margins["delay_margin_ms"]["predicted"] < 60.0
+    assert "every 2. period" in margins_table(summary)
+    plot_margins(predicted, summary, tmp_path / "margins.png")
+    assert (tmp_path / "margins.png").stat().st_size > 1000
 
 
 def test_another_robot_is_the_robot_that_moves(holding):
@@ -145,9 +184,8 @@ def test_what_has_no_margins_is_refused(lemniscate):
         predict_delay_margin(lemniscate, load_tuning(CONTROLLERS / "nonlinear.toml"))
     with pytest.raises(MarginsError, match="measures nothing"):
         predict_delay_margin(lemniscate, load_tuning(CONTROLLERS / "open_loop.toml"))
-    late = replace(lemniscate, camera=Camera(latency=0.02, every=2))
-    with pytest.raises(MarginsError, match="20 ms late, sees every 2"):
-        predict_delay_margin(late)
+    with pytest.raises(MarginsError, match="loses 10 % of its pictures"):
+        predict_delay_margin(replace(lemniscate, camera=Camera(lost=0.1)))
     observer = replace(lemniscate.tuning.observer, adapts=("tip_mass",))
     with pytest.raises(MarginsError, match="adapts tip_mass"):
         predict_delay_margin(lemniscate, replace(lemniscate.tuning, observer=observer))

@@ -24,9 +24,9 @@ _ROWS = {
 def margins_table(summary: dict[str, Any]) -> str:
     """Predicted and measured margins, side by side, with the pose where each is least."""
     margins = summary["margins"]
-    lines = [(text, margins[name]) for name, text in _ROWS.items()]
+    lines = [(text, margins[name]) for name, text in _ROWS.items() if name in margins]
     for name, text in (("gain_margin", "gain"), ("phase_margin_deg", "phase [deg]")):
-        lines += [(f"{text} at motor {i}", each) for i, each in enumerate(margins[name])]
+        lines += [(f"{text} at motor {i}", each) for i, each in enumerate(margins.get(name, ()))]
     rows = [
         (
             text,
@@ -44,12 +44,16 @@ def margins_table(summary: dict[str, Any]) -> str:
         f"loop has    {summary['told_delay_ms']:g} ms of delay that is told, {summary['untold_delay_ms']:g} ms untold, "
         f"motors that lag by {summary['lag_ms']:g} ms; margins count from there",
     ]
+    if summary["tip_late_ms"] or summary["tip_every"] > 1:
+        head.append(f"camera      {summary['tip_late_ms']:g} ms late, a tip in every {summary['tip_every']}. period")
     tail = [f"Predicted at {summary['poses']} poses of the reference, where it is least; measured in the nonlinear "
             "simulation, held there."]  # fmt: skip
     text = f"Following the reference it bears {_number(along['predicted_along_path'])} ms of further delay, predicted"
     if "measured_along_path" in along:
         text += f"; {_number(along['measured_along_path'])} ms, measured"
     tail.append(f"{text}.")
+    if summary["tip_every"] > 1:
+        tail.append("Gain, phase and sensitivity have no plain meaning where the tip is not measured in every period.")
     if not (margins["spectral_radius"]["predicted"] or 0.0) < 1.0:
         tail.append("NOT STABLE AS IT IS: take a slower tuning, or tell the controller of its delays.")
     header = ("margin", "predicted", "measured", "at [s]", "tip [mm]")
@@ -66,15 +70,7 @@ def plot_margins(predicted: Margins, summary: dict[str, Any], path: Path) -> Non
     margins = summary["margins"]
     worst = int(np.nan_to_num(predicted.delay).argmin())
     _eigenvalues(axes[0, 0], predicted, worst)
-    shown = axes[0, 1]
-    low, high = predicted.response.min(axis=0), predicted.response.max(axis=0)
-    shown.fill_between(predicted.frequencies, low, high, color=SKY, alpha=0.5, label="all poses")
-    shown.plot(predicted.frequencies, predicted.response[worst], color=BLUE,
-               label=f"where the delay margin is least, t = {predicted.t[worst]:.2f} s")  # fmt: skip
-    shown.axhline(1.0, color="black", lw=0.8, ls="--")
-    shown.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="sensitivity at the motors [-]",
-              title=f"Sensitivity, peak {predicted.sensitivity.max():.3g}")  # fmt: skip
-    shown.legend(loc="lower right")
+    _sensitivity(axes[0, 1], predicted, worst)
 
     times = axes[1, 0]
     for name, values, colour, text in (
@@ -102,6 +98,22 @@ def plot_margins(predicted: Margins, summary: dict[str, Any], path: Path) -> Non
     save_figure(figure, path)
 
 
+def _sensitivity(axes: Any, predicted: Margins, worst: int) -> None:
+    if predicted.response is None or predicted.sensitivity is None:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, f"no sensitivity:\nthe tip is measured in every {predicted.cycle}. period", ha="center",
+                  va="center", color=GREY)  # fmt: skip
+        return
+    low, high = predicted.response.min(axis=0), predicted.response.max(axis=0)
+    axes.fill_between(predicted.frequencies, low, high, color=SKY, alpha=0.5, label="all poses")
+    axes.plot(predicted.frequencies, predicted.response[worst], color=BLUE,
+              label=f"where the delay margin is least, t = {predicted.t[worst]:.2f} s")  # fmt: skip
+    axes.axhline(1.0, color="black", lw=0.8, ls="--")
+    axes.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="sensitivity at the motors [-]",
+             title=f"Sensitivity, peak {predicted.sensitivity.max():.3g}")  # fmt: skip
+    axes.legend(loc="lower right")
+
+
 def _eigenvalues(axes: Any, predicted: Margins, worst: int) -> None:
     circle = np.exp(2j * np.pi * np.linspace(0.0, 1.0, 361))
     axes.plot(circle.real, circle.imag, color="black", lw=0.8)
@@ -109,8 +121,9 @@ def _eigenvalues(axes: Any, predicted: Margins, worst: int) -> None:
     axes.plot(everywhere.real, everywhere.imag, ".", color=GREY, ms=4, alpha=0.6, label="all poses")
     at = predicted.eigenvalues[worst]
     axes.plot(at.real, at.imag, "x", color=BLUE, ms=6, label="where the delay margin is least")
+    cycle = "a period" if predicted.cycle == 1 else f"{predicted.cycle} periods"
     axes.set(xlabel="real part [-]", ylabel="imaginary part [-]",
-             title=f"Eigenvalues of a period, largest {predicted.radius.max():.3f}")  # fmt: skip
+             title=f"Eigenvalues of {cycle}, largest {np.abs(everywhere).max():.3f}")  # fmt: skip
     axes.set_aspect("equal")
     axes.set_xlim(-1.9, 1.9)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=9)

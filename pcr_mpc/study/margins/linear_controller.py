@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +45,8 @@ class Believed(NamedTuple):
         Control periods that are predicted over.
     pull : float
         Share by which measured angles pull in a period those that are planned from; 1: these are the measured ones.
+    age : float
+        That a measured tip is known to have when it arrives, in periods.
     """
 
     model: LinearModel
@@ -52,6 +55,7 @@ class Believed(NamedTuple):
     gain: np.ndarray | None
     delay: int
     pull: float = 1.0
+    age: float = 0.0
 
 
 def feedback_of(law: Law, believed: Believed, limits: Limits, resting: LinearModel) -> Feedback:
@@ -98,27 +102,40 @@ def _mpc_feedback(model: LinearModel, tuning: Tuning, limits: Limits, terminal: 
     return Feedback(*np.split(np.stack(columns, axis=1), ends, axis=1))
 
 
-def linear_controller(believed: Believed, feedback: Feedback) -> Sampled:
-    """The controller as a linear system from measured states to rates.
+def linear_controller(believed: Believed, feedback: Feedback, *, seen: bool = True) -> Sampled:
+    """The controller as a linear system from measured states to rates, in a period in which the tip is seen, or not.
 
     Its state is [state expected at the measurement, observed force, commands that it knows to be on the way, the oldest
-    first, last rates, angles to which the commands lead]. The target of the motors is where the rods carry the observed
-    force: at rest its Newton iteration has converged.
+    first, last rates, angles to which the commands lead, estimates [p, v, force] back to the age of a picture, the
+    oldest first]. The target of the motors is where the rods carry the observed force: at rest its Newton iteration has
+    converged.
     """
     model, gain = believed.model, believed.gain
     n_states, n = model.B.shape
-    sizes = [n_states, 2, *[n] * believed.delay, n, n, n_states]
+    kept = math.ceil(believed.age - 1e-9)
+    sizes = [n_states, 2, *[n] * believed.delay, n, n, *[6] * kept, n_states]
     # Every quantity is a matrix by which it depends on [state, measurement].
-    expected, force, *on_the_way, before, led, measured = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
+    expected, force, *rest = np.split(np.eye(sum(sizes)), np.cumsum(sizes)[:-1])
+    on_the_way, (before, led), past = rest[: believed.delay], rest[believed.delay : -1 - kept], rest[-1 - kept : -1]
+    measured = rest[-1]
     if gain is None:
-        estimate, force = measured, 0.0 * force
+        estimate, force = measured if seen else np.vstack([expected[:4], measured[4:]]), 0.0 * force
     else:
         tip = expected[:4]
+        if seen and past:
+            moves = np.eye(6)
+            moves[:4, :4], moves[:4, 4:] = model.A[:4, :4], model.E[:4]
+            change = gain @ (measured[:2] - _tip_then([*past, tip], kept - believed.age, model.dt))
+            for j in range(kept):
+                past[j] = past[j] + change
+                change = moves @ change
+            tip, force = tip + change[:4], force + change[4:]
         if believed.pull < 1.0:  # the tip has moved with the angles as they are measured to have turned
             tip = tip + model.B[:4] @ (measured[4:] - expected[4:]) / model.dt
-        surprise = measured[:2] - tip[:2]
-        estimate = np.vstack([tip + gain[:4] @ surprise, measured[4:]])
-        force = force + gain[4:] @ surprise
+        if seen and not past:
+            surprise = measured[:2] - tip[:2]
+            tip, force = tip + gain[:4] @ surprise, force + gain[4:] @ surprise
+        estimate = np.vstack([tip, measured[4:]])
     ahead = estimate
     for u in on_the_way:
         ahead = model.A @ ahead + model.B @ u + model.E @ force
@@ -128,6 +145,16 @@ def linear_controller(believed: Believed, feedback: Feedback) -> Sampled:
     u = feedback.state @ ahead + feedback.shift @ shift + feedback.force @ force + feedback.previous @ before
     on_the_way = [*on_the_way, u]
     following = model.A @ estimate + model.B @ on_the_way[0] + model.E @ force
-    state = np.vstack([following, force, *on_the_way[1:], u, planned])
+    past = [*past, np.vstack([estimate[:4], force])][1:] if kept else []
+    state = np.vstack([following, force, *on_the_way[1:], u, planned, *past])
     (a, b), (c, d) = (np.split(each, [len(state)], axis=1) for each in (state, u))
     return Sampled(a, b, c, d)
+
+
+def _tip_then(knots: list[np.ndarray], s: float, dt: float) -> np.ndarray:
+    """Tip a fraction s of a period after the first of [p, v] at the ends of periods: Hermite's cubic."""
+    start, end = knots[:2]
+    return np.asarray(
+        (1 + 2 * s) * (1 - s) ** 2 * start[:2] + s * (1 - s) ** 2 * dt * start[2:4]
+        + s**2 * (3 - 2 * s) * end[:2] - s**2 * (1 - s) * dt * end[2:4]
+    )  # fmt: skip

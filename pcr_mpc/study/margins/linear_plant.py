@@ -38,7 +38,7 @@ class LinearPlant(Frozen):
     A: np.ndarray
     B: np.ndarray
 
-    def sampled(self, period: float, delay: float, lag: float = 0.0) -> Sampled:
+    def sampled(self, period: float, delay: float, lag: float = 0.0, latency: float = 0.0) -> Sampled:
         """What lies between the commands of a period and the state at its start.
 
         Parameters
@@ -49,11 +49,14 @@ class LinearPlant(Frozen):
             Time after which it reaches the motors, any [s]: a fraction of a period splits the next one in two.
         lag : float
             Time constant with which the motors' rates follow their commands [s].
+        latency : float
+            Age of a measured tip, any [s].
 
         Returns
         -------
         Sampled
-            Its state is [x, rates of lagging motors, commands on the way, the last one first]; its output x.
+            Its state is [x, rates of lagging motors, commands on the way, the last one first, late tips likewise]; its
+            output x, with the tip where it was.
         """
         n_states, n = self.B.shape
         a, b = self.A, self.B
@@ -67,19 +70,37 @@ class LinearPlant(Frozen):
         begin, early = _held(a, b, fraction * period)
         rest, late = _held(a, b, (1.0 - fraction) * period)
         on_the_way = periods + (fraction > 0.0)
-        whole = size + on_the_way * n
-        a_all, b_all = np.zeros((whole, whole)), np.zeros((whole, n))
-        a_all[:size, :size] = rest @ begin
-        effects = {periods: late} | ({periods + 1: rest @ early} if fraction else {})
-        for age, effect in effects.items():
-            if age == 0:
-                b_all[:size] += effect
-            else:
-                a_all[:size, size + (age - 1) * n : size + age * n] += effect
+        pictures = math.ceil(latency / period - _ROUNDING)
+        commands = size + on_the_way * n
+        whole = commands + 2 * pictures
+        a_all, b_all, c_all = np.zeros((whole, whole)), np.zeros((whole, n)), np.eye(n_states, whole)
+
+        def moves(rows: slice, state: np.ndarray, effects: dict[int, np.ndarray]) -> None:
+            """Write what the state at the start, and commands that are so many periods old, do to some rows."""
+            a_all[rows, :size] = state
+            for age, effect in effects.items():
+                if age == 0:
+                    b_all[rows] = effect
+                else:
+                    a_all[rows, size + (age - 1) * n : size + age * n] = effect
+
+        moves(slice(0, size), rest @ begin, {periods: late} | ({periods + 1: rest @ early} if fraction else {}))
         if on_the_way:
             b_all[size : size + n] = np.eye(n)
-            a_all[size + n :, size:-n] = np.eye((on_the_way - 1) * n)
-        return Sampled(a_all, b_all, np.eye(n_states, whole), np.zeros((n_states, n)))
+            a_all[size + n : commands, size : commands - n] = np.eye((on_the_way - 1) * n)
+        if pictures:
+            # The picture that is taken in this period is at hand so many periods later.
+            taken = pictures * period - latency
+            if taken <= fraction * period:
+                state, effect = _held(a, b, taken)
+                moves(slice(commands, commands + 2), state[:2], {periods + 1: effect[:2]} if fraction else {})
+            else:
+                state, effect = _held(a, b, taken - fraction * period)
+                moves(slice(commands, commands + 2), state[:2] @ begin,
+                      {periods: effect[:2]} | ({periods + 1: state[:2] @ early} if fraction else {}))  # fmt: skip
+            a_all[commands + 2 :, commands:-2] = np.eye(2 * (pictures - 1))
+            c_all[:2], c_all[:2, -2:] = 0.0, np.eye(2)
+        return Sampled(a_all, b_all, c_all, np.zeros((n_states, n)))
 
 
 def linear_plant(plant: Plant, x: np.ndarray) -> LinearPlant:

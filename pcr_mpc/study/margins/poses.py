@@ -39,14 +39,15 @@ class PoseOfReference:
         Of the rods of the robot that moves.
     payload : float
         [kg].
-    controller : Sampled
+    controllers : tuple of Sampled
+        In the periods from one picture to the next.
     """
 
     t: float
     x: np.ndarray
     pose: Equilibrium
     payload: float
-    controller: Sampled
+    controllers: tuple[Sampled, ...]
 
 
 class LinearLoops:
@@ -120,6 +121,8 @@ class LinearLoops:
         law: Law = make_law(scene, tuning, robot, limits, start, lambda p, q, force: q)
         law.prepare(resting)
         delay = scene.delay if tuning.model.predict_delay else 0
+        age = tuning.observer.latency / period if tuning.observer else 0.0
+        every = (scene.camera or IDEAL_CAMERA).every
         found = []
         for k in sorted({round(k) for k in np.linspace(0, scene.n_periods - 1, count).tolist()}):
             x, t = reference.states[k], k * period
@@ -129,11 +132,10 @@ class LinearLoops:
             there: LinearModel = linearise(model, x, np.zeros(n), period)
             _, stiffness, by_angle = target.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
             believed = Believed(there, stiffness.copy(), by_angle.copy(), None if observer is None else observer.gain,
-                                delay, pull(tuning.model, period))  # fmt: skip
+                                delay, pull(tuning.model, period), age)  # fmt: skip
             feedback: Feedback = feedback_of(law, believed, limits, resting)
-            found.append(
-                PoseOfReference(t, x.copy(), real.equilibrium(x), payload, linear_controller(believed, feedback))
-            )
+            phases = tuple(linear_controller(believed, feedback, seen=not phase) for phase in range(every))
+            found.append(PoseOfReference(t, x.copy(), real.equilibrium(x), payload, phases))
         return found
 
     def _plant(self, robot: Robot) -> Plant:
@@ -151,8 +153,8 @@ class LinearLoops:
             plant.carry(pose.payload, pose.x)
         lag = 0.0 if scene.motors is None else scene.motors.time_constant
         return LinearLoop(
-            pose.t, pose.x[:2].copy(), linear_plant(plant, pose.x), pose.controller, scene.period,
-            scene.delay * scene.period + scene.untold_delay, lag,
+            pose.t, pose.x[:2].copy(), linear_plant(plant, pose.x), pose.controllers, scene.period,
+            scene.delay * scene.period + scene.untold_delay, lag, (scene.camera or IDEAL_CAMERA).latency,
         )  # fmt: skip
 
     def all(self) -> list[LinearLoop]:
@@ -161,13 +163,10 @@ class LinearLoops:
 
 
 def _not_linear(scene: Scene, tuning: Tuning) -> str:
-    """What of a loop has no place in a linear one that is the same in every period; empty if there is nothing."""
+    """What of a loop has no place in a linear one that repeats; empty if there is nothing."""
     camera, observer = scene.camera, tuning.observer
-    if camera is not None and camera != IDEAL_CAMERA:
-        return (f"the camera is {1e3 * camera.latency:g} ms late, sees every {camera.every}. period and loses "
-                f"{100 * camera.lost:g} % of its pictures")  # fmt: skip
-    if observer is not None and observer.latency:
-        return f"its observer takes tips to be {1e3 * observer.latency:g} ms old"
+    if camera is not None and camera.lost:
+        return f"the camera loses {100 * camera.lost:g} % of its pictures, nobody knows which"
     if observer is not None and observer.adapts:
         return f"its observer adapts {', '.join(observer.adapts)}"
     return ""

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from .search import first_loss
 LONGEST, _PER_PERIOD = 30, 4  # periods of delay that are tried, and steps of each
 _DELAY_TOLERANCE, _FACTOR_TOLERANCE = 1e-3, 2e-3  # of a period; of a factor
 _FACTORS = np.geomspace(1.0, 32.0, 21)  # from one to the next 19 % more
-_STAY = 8  # periods at each pose
+_STAY = 8  # periods at each pose, or the next multiple of a cycle
 _FREQUENCIES = 400  # from a thousandth of the Nyquist frequency on
 
 
@@ -68,19 +69,22 @@ class Margins(Frozen):
         Further delay that the loop bears [s].
     path_delay : float
         The same on the way along all poses, where it may be unstable for a moment [s].
-    gain, phase : ndarray, shape (M, n)
+    cycle : int
+        Periods from one picture of the tip to the next. Beyond 1 a frequency that goes in comes out as several: there
+        is no ``gain``, ``phase``, ``sensitivity`` and ``response`` then (None).
+    gain, phase : ndarray, shape (M, n), or None
         Gain margin [-] and phase margin [deg] at each motor, the others closed, by python-control.
     stiffness, mass : ndarray, shape (M,)
         Largest factor on EI of all rods and on the tip mass.
     lag : ndarray, shape (M,)
         Largest time constant of the motors, the scene's own included [s].
-    sensitivity : ndarray, shape (M,)
+    sensitivity : ndarray, shape (M,), or None
         Peak over frequency of the largest singular value of the sensitivity at the motors.
     eigenvalues : ndarray, shape (M, size)
-        Of a period.
+        Of a cycle.
     frequencies : ndarray, shape (F,)
         [Hz].
-    response : ndarray, shape (M, F)
+    response : ndarray, shape (M, F), or None
         Largest singular value of the sensitivity.
     """
 
@@ -92,15 +96,16 @@ class Margins(Frozen):
     radius: np.ndarray
     delay: np.ndarray
     path_delay: float
-    gain: np.ndarray
-    phase: np.ndarray
+    cycle: int
+    gain: np.ndarray | None
+    phase: np.ndarray | None
     stiffness: np.ndarray
     mass: np.ndarray
     lag: np.ndarray
-    sensitivity: np.ndarray
+    sensitivity: np.ndarray | None
     eigenvalues: np.ndarray
     frequencies: np.ndarray
-    response: np.ndarray
+    response: np.ndarray | None
 
     def least(self, values: np.ndarray, *, largest: bool = False) -> Least:
         """Of the margins ``values``, shape (M,), the least, or the largest of what should be small."""
@@ -109,17 +114,19 @@ class Margins(Frozen):
         return Least(float(values[at]), float(self.t[at]), (float(self.p[at, 0]), float(self.p[at, 1])))
 
     def summary(self) -> dict[str, Any]:
-        """Figures, ready for JSON."""
-        return {
+        """Figures, ready for JSON; those that a loop does not have are left out."""
+        found: dict[str, Any] = {
             "spectral_radius": self.least(self.radius, largest=True).summary(),
             "delay_margin_ms": self.least(1e3 * self.delay).summary(),
-            "gain_margin": [self.least(each).summary() for each in self.gain.T],
-            "phase_margin_deg": [self.least(each).summary() for each in self.phase.T],
             "stiffness_factor": self.least(self.stiffness).summary(),
             "mass_factor": self.least(self.mass).summary(),
             "motor_lag_ms": self.least(1e3 * self.lag).summary(),
-            "sensitivity_peak": self.least(self.sensitivity, largest=True).summary(),
         }
+        if self.sensitivity is not None and self.gain is not None and self.phase is not None:
+            found["sensitivity_peak"] = self.least(self.sensitivity, largest=True).summary()
+            found["gain_margin"] = [self.least(each).summary() for each in self.gain.T]
+            found["phase_margin_deg"] = [self.least(each).summary() for each in self.phase.T]
+        return found
 
 
 def delay_margin(*loops: LinearLoop) -> float:
@@ -135,11 +142,12 @@ def path_radius(loops: Sequence[LinearLoop]) -> float:
     again and again: on a path a loop may be unstable for a moment, and recover."""
     if len(loops) == 1:
         return loops[0].spectral_radius()
-    product = np.eye(len(loops[0].closed().A))
-    for loop in loops:
-        product = np.linalg.matrix_power(loop.closed().A, _STAY) @ product
+    cycle = loops[0].cycle
+    times = math.ceil(_STAY / cycle)
+    powers = [np.linalg.matrix_power(loop.transition(), times) for loop in loops]
+    product = reduce(lambda before, power: power @ before, powers)
     largest = float(np.abs(np.linalg.eigvals(product)).max())
-    return float(largest ** (1.0 / (_STAY * len(loops))))
+    return float(largest ** (1.0 / (times * cycle * len(loops))))
 
 
 def predict_delay_margin(
@@ -177,7 +185,8 @@ def predict_margins(scene: Scene, tuning: Tuning | None = None, *, poses: int = 
     """Margins of the loop as it runs, predicted from linear closed loops about poses along the reference.
 
     The loop is the robot, the law's gain without active limits, observer, motor target, prediction of the told delay,
-    untold delay and the motors' lag. What the scene says of these is in; margins are counted from there.
+    untold delay, the motors' lag, and a camera that is late or rare. What the scene says of these is in; margins are
+    counted from there.
 
     Parameters
     ----------
@@ -200,8 +209,10 @@ def predict_margins(scene: Scene, tuning: Tuning | None = None, *, poses: int = 
     linear = loops.all()
     period = loops.scene.period
     frequencies = np.geomspace(1e-3, 0.999, _FREQUENCIES) * 0.5 / period
-    classical = [_classical(loop, frequencies) for loop in linear]
-    responses = np.stack([_sensitivity(loop, frequencies) for loop in linear])
+    cycle = linear[0].cycle
+    alike = cycle == 1
+    classical = [_classical(loop, frequencies) for loop in linear] if alike else []
+    responses = np.stack([_sensitivity(loop, frequencies) for loop in linear]) if alike else None
     spectra = [loop.eigenvalues() for loop in linear]
     return Margins(
         scene=loops.scene.name,
@@ -209,15 +220,16 @@ def predict_margins(scene: Scene, tuning: Tuning | None = None, *, poses: int = 
         period=period,
         t=np.array([loop.t for loop in linear]),
         p=np.stack([loop.p for loop in linear]),
-        radius=np.array([float(np.abs(each).max()) for each in spectra]),
+        radius=np.array([float(np.abs(each).max() ** (1.0 / cycle)) for each in spectra]),
         delay=np.array([delay_margin(loop) for loop in linear]),
         path_delay=delay_margin(*linear),
-        gain=np.array([[gain for gain, _ in each] for each in classical]),
-        phase=np.array([[phase for _, phase in each] for each in classical]),
+        cycle=cycle,
+        gain=np.array([[gain for gain, _ in each] for each in classical]) if alike else None,
+        phase=np.array([[phase for _, phase in each] for each in classical]) if alike else None,
         stiffness=np.array([_factor(loops, pose, "stiffness") for pose in loops.poses]),
         mass=np.array([_factor(loops, pose, "mass") for pose in loops.poses]),
         lag=np.array([_largest_lag(loop) for loop in linear]),
-        sensitivity=responses.max(axis=1),
+        sensitivity=None if responses is None else responses.max(axis=1),
         eigenvalues=np.stack(spectra),
         frequencies=frequencies,
         response=responses,

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from ...control.tuning import Tuning
+from ...loop.hardware.camera import IDEAL as IDEAL_CAMERA
 from ...loop.hardware.motors import IDEAL
 from ...loop.scene.scene import Scene
 from .measured import Measured, measure_delay_margin, measure_largest
@@ -40,7 +41,8 @@ def compare_margins(
         where it is least (``t_s``, ``p_m``) and ``measured`` for a tip that is held there; the delay margin also
         ``predicted_along_path`` and ``measured_along_path``, where a loop may be unstable for a moment.
         ``spectral_radius``, ``sensitivity_peak`` and, for each motor, ``gain_margin`` and ``phase_margin_deg`` are
-        predicted only. None: no limit was found; a margin of 0, or a factor of 1: the loop is not stable as it is.
+        predicted only; the last three are left out where the tip is not measured in every period. None: no limit was
+        found; a margin of 0, or a factor of 1: the loop is not stable as it is.
 
     Raises
     ------
@@ -55,7 +57,7 @@ def compare_margins(
         name: {"predicted": said["value"], "t_s": said["t_s"], "p_m": said["p_m"]} for name, said in found.items()
         if isinstance(said, dict)
     }  # fmt: skip
-    for name in ("gain_margin", "phase_margin_deg"):
+    for name in {"gain_margin", "phase_margin_deg"} & set(found):
         rows[name] = [{"predicted": said["value"], "t_s": said["t_s"], "p_m": said["p_m"]} for said in found[name]]
     along_path = 0.0 if math.isnan(predicted.path_delay) else 1e3 * predicted.path_delay
     rows["delay_margin_ms"]["predicted_along_path"] = along_path if math.isfinite(along_path) else None
@@ -83,6 +85,8 @@ def compare_margins(
         "told_delay_ms": 1e3 * told.delay * told.period,
         "untold_delay_ms": 1e3 * told.untold_delay,
         "lag_ms": 1e3 * (told.motors or IDEAL).time_constant,
+        "tip_late_ms": 1e3 * (told.camera or IDEAL_CAMERA).latency,
+        "tip_every": predicted.cycle,
         "poses": len(predicted.t),
         "margins": rows,
     }
