@@ -33,10 +33,10 @@ from matplotlib.colors import LogNorm
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as MarkerPath
 
-from experiments.workspace_sheet import REACH, End, Mesh, Sheet, Site, explore, make_mesh, neighbours, turn_between
 from pcr_mpc import Robot, assess_stability, inverse_statics, load_robot
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import GREY, ORANGE, PURPLE, RED, SKY, plt
+from pcr_mpc.study.workspace_sheet import REACH, End, Mesh, Sheet, Site, explore, make_mesh, neighbours, turn_between
 
 MODES = ("LR", "RL", "LL")
 POSE_COLUMNS = ("mode", "x", "y", "q0", "q1", "stable", "within_stops", "k_soft", "k_stiff", "motor_authority", "det_g",

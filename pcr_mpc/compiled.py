@@ -72,7 +72,7 @@ def compiled(function: Any) -> Any:
     generator.add(function)
     source = generator.dump()
     key = _digest("\0".join([source, platform.machine(), _version(), *_compiler(), *_FLAGS]).encode())
-    cache = _cache()
+    cache = cache_folder()
     library = None if cache is None else _found(cache, key)
     if library is not None:
         return _loaded(function.name(), library)
@@ -156,7 +156,7 @@ def _found(cache: Path, key: str) -> Path | None:
     return None
 
 
-def _cache() -> Path | None:
+def cache_folder() -> Path | None:
     """Return the cache folder, made if need be; None where it cannot be written, or others could write to it."""
     try:
         # As the XDG base directory specification has it, a path that is not absolute does not count.

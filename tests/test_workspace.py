@@ -8,8 +8,8 @@ import pytest
 
 from experiments import workspace
 from experiments.workspace import areas, stop_distance
-from experiments.workspace_sheet import Sheet, explore, turn_between
 from pcr_mpc import Equilibrium, PCRError, Robot, forward_statics, inverse_statics, solve_statics
+from pcr_mpc.study.workspace_sheet import Sheet, explore, turn_between
 
 
 @pytest.fixture(scope="module")

@@ -26,6 +26,7 @@ examples:
   pcr-mpc excite lemniscate --duration 6                a motion worth recording
   pcr-mpc generate lemniscate --out build/lemniscate       controller and plant as C
   pcr-mpc hil lemniscate                                in real time, the controller over a wire
+  pcr-mpc view lemniscate                               the robot live in a browser: pull at it
   pcr-mpc timing lemniscate                             step times against the real-time budgets
   pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
   pcr-mpc margins lemniscate                            how much delay, lag and mismatch the loop bears
@@ -236,6 +237,23 @@ def parser() -> argparse.ArgumentParser:
     )
     loop.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
     loop.add_argument("--controller", type=Path, metavar="FILE|NAME", help="tuning instead of the scene's own")
+    look = command(
+        "view",
+        "view",
+        "view",
+        "Show a scene live in a browser: the plant and its controller run, and you pull at the tip, move the target, "
+        "turn motors, limits, load, noise and delay. docs/view.md says more. Ctrl-C ends it.",
+    )
+    look.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
+    look.add_argument("--controller", type=tuning_or_class, metavar="FILE|NAME|MODULE:CLASS",
+                      help="to begin with, instead of the scene's own")  # fmt: skip
+    look.add_argument("--no-browser", action="store_true", help="open none; the address is on stderr")
+    look.add_argument("--host", default="127.0.0.1", help="where to listen (default 127.0.0.1)")
+    look.add_argument("--port", type=int, default=0, help="where to listen (default: a free one)")
+    look.add_argument("--anywhere", action="store_true", help="allow a host that is no loopback address: whoever sees "
+                      "the page's address there moves the robot")  # fmt: skip
+    look.add_argument("--seed", type=int, default=0, help="of the measurement noise (default 0)")
+    look.add_argument("--out", type=Path, metavar="DIR", help="folder for recordings (default results/view/NAME)")
     for served in (server, loop):
         served.add_argument("--generated", action="store_true", help="the controller as generated C, which is compiled "
                             "first, instead of Python's")  # fmt: skip

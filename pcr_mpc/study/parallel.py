@@ -48,7 +48,7 @@ def local_workers(jobs: int | None = None) -> Iterator[ProcessPoolExecutor]:
         context = multiprocessing.get_context("spawn")
         resource_tracker.ensure_running()  # which, when it is started, lets signals through
         others = set(multiprocessing.active_children())
-        executor = _Workers(jobs, mp_context=context, initializer=_follow_the_parent)
+        executor = _Workers(jobs, mp_context=context, initializer=follow_the_parent)
         try:
             yield executor
         except BaseException:
@@ -138,7 +138,8 @@ def _unportable(name: str, thing: Any) -> tuple[str, Any]:
     return name, thing
 
 
-def _follow_the_parent() -> None:
+def follow_the_parent() -> None:
+    """In another process: leave Ctrl-C to the one that started it, and end with that."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # A parent that is killed leaves its workers waiting for ever.
     threading.Thread(target=_end_with_the_parent, daemon=True).start()

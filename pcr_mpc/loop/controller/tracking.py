@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ...control.laws import Law
 from ...control.observer import DisturbanceObserver, ObserverTuning
 from ...control.tuning import Tuning
-from ...errors import PCRError
+from ...errors import PCRError, checked_vector
 from ...frozen import Remade, set_once
 from ...linearisation.linear_model import LinearModel
 from ...linearisation.pose_limits import LimitWatch
@@ -103,7 +103,7 @@ class TrackingController(OnTheFly, Remade):
 
     def start(
         self, pose: Equilibrium | ArrayLike, q: ArrayLike | None = None, *, mode: str | None = None,
-        load: float | None = None,
+        load: float | None = None, velocity: ArrayLike | None = None,
     ) -> None:  # fmt: skip
         """Get ready, in a pose or where the robot is measured to stand.
 
@@ -121,6 +121,9 @@ class TrackingController(OnTheFly, Remade):
             Working mode, where several fit the measurements (see `find_start`).
         load : float, optional
             Greatest load that may act on the tip at the start [N] (see `find_start`).
+        velocity : array_like, shape (2,), optional
+            Of the tip [m/s], where the robot passes through ``pose``, an equilibrium of its rods: what these carry is
+            then taken for inertia, not for a load, and the reference begins there as from measurements.
 
         Raises
         ------
@@ -130,14 +133,17 @@ class TrackingController(OnTheFly, Remade):
         if q is not None:
             self._start_live(find_start(self.robot, pose, q, sensors=self._sensors, mode=mode, load=load))
             return
+        if velocity is not None and isinstance(pose, Equilibrium):
+            self._start_live(StartPose(pose, np.zeros(2)), checked_vector("velocity", velocity, 2))
+            return
         if not isinstance(pose, Equilibrium):
             raise ValueError(f"start({pose!r}): give an Equilibrium, or the measured tip and motor angles, start(p, q)")
         self._work.pose, self._live = pose, None
         self._invert_dynamics(self._known)
         self._begin(pose)
 
-    def _start_live(self, found: StartPose) -> None:
-        """Get ready for a loop that keeps its own time, in a pose under a load."""
+    def _start_live(self, found: StartPose, velocity: np.ndarray | None = None) -> None:
+        """Get ready for a loop that keeps its own time, in a pose under a load, or in motion."""
         note = self._require_observer()
         self._work.pose, self._work.u = found.pose, np.zeros(self.robot.n_rods)
         live = self._live
@@ -146,7 +152,7 @@ class TrackingController(OnTheFly, Remade):
         live.reference.start(found.pose, 0)
         self._work.track = live.reference
         self._begin(found.pose)
-        live.start(found)
+        live.start(found, velocity=velocity)
         if self._scene.trajectory is not None:
             live.follow(self._scene.trajectory, None)
         live.notes += note

@@ -110,14 +110,14 @@ class LiveLoop:
         self._seen: deque[tuple[int, np.ndarray, np.ndarray]] = deque(maxlen=_RETURNED)
         self._last: Decision | None = None
 
-    def start(self, found: StartPose, k: int = 0) -> None:
-        """Stand in a pose; the next call of `step` is for period k."""
+    def start(self, found: StartPose, k: int = 0, velocity: np.ndarray | None = None) -> None:
+        """Stand in a pose, or pass it at a velocity of the tip [m/s]; the next call of `step` is for period k."""
         self._clock.start()
         self.k = k - 1
         self._wish, self.notes, self._resting, self._silent = Wish(), [], False, [0, 0]
         self._seen.clear()
         self._last = None
-        self._stand(k, found, np.zeros(2))
+        self._stand(k, found, np.zeros(2) if velocity is None else velocity)
 
     def take_over(self, known: Reference, k: int, pose: Equilibrium, path: Trajectory | None) -> None:
         """Go on after period k with a reference that was solved from ``pose`` on."""

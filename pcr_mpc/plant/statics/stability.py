@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import ConvergenceError, PCRError, checked_vector
+from ...errors import ConvergenceError, PCRError, checked_integer, checked_vector
 from ...frozen import Frozen
 from ..robot import Robot
 from ..rods import elastica
@@ -86,8 +86,13 @@ def least_rod_margin(eq: Equilibrium) -> float:
 
     Cheaper than `assess_stability`, where many poses are gone through.
     """
+    return min(rod_margins(eq))
+
+
+def rod_margins(eq: Equilibrium) -> list[float]:
+    """1 - lambda / lambda_c of each rod, as `least_rod_margin` has it."""
     if eq.robot.needs_shooting is not None:
-        return float("nan")
+        return [float("nan")] * eq.robot.n_rods
     margins = []
     for i, (force, rod) in enumerate(zip(eq.rod_forces.tolist(), eq.robot.rods, strict=True)):
         load = rod.length * math.sqrt(math.hypot(*force) / rod.bending_stiffness)
@@ -96,7 +101,7 @@ def least_rod_margin(eq: Equilibrium) -> float:
             log_tip_angle, load, _ = elastica.from_nodes(eq.nodes[i])
             bound = 1.0 - load / critical_load(log_tip_angle)
         margins.append(bound)
-    return min(margins)
+    return margins
 
 
 def count_conjugate_points(eq: Equilibrium, segments: int = 16) -> int:
@@ -174,7 +179,9 @@ def distance_to_fold(eq: Equilibrium, p_end: Any, q_end: Any, tolerance: float =
     return done
 
 
-def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0, 0.0)) -> list[Equilibrium]:
+def all_equilibria(
+    robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0, 0.0), *, starts: int = 8
+) -> list[Equilibrium]:
     """Every equilibrium for given motor angles: "what else could it snap to?"
 
     Parameters
@@ -185,14 +192,16 @@ def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0
         Motor angles [rad].
     force : array_like, shape (2,)
         External force on a free tip besides its own weight m g [N], as `forward_statics` takes it.
+    starts : int
+        Positions of a free tip in a rod length from which poses are looked for.
 
     Returns
     -------
     list of Equilibrium
         By energy (free tip: potential energy, that of the weight included), each with its verdict ``stable``. A held
         tip's list is complete to the resolution of the chart (see `chart.stable_shapes`). A free tip's holds every
-        pose to which Newton's method or the energy's descent lead from tip positions L/8 apart on every sheet of
-        stable rods; nothing proves that there are no others.
+        pose to which Newton's method or the energy's descent lead from tip positions L / ``starts`` apart on every
+        sheet of stable rods; nothing proves that there are no others.
 
     Raises
     ------
@@ -207,7 +216,7 @@ def all_equilibria(robot: Robot, p: Any = None, q: Any = None, force: Any = (0.0
         p = checked_vector("p", p, 2)
         robot.require_reachable(p)
         return held_equilibria(robot, p, q)
-    spacing = robot.lengths.min() / 8
+    spacing = robot.lengths.min() / checked_integer("starts", starts)
     low = (robot.bases - robot.lengths[:, None]).min(axis=0)
     high = (robot.bases + robot.lengths[:, None]).max(axis=0)
     free: list[Equilibrium] = []

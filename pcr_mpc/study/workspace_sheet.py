@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from pcr_mpc import Equilibrium, PCRError, Robot, inverse_statics
-from pcr_mpc.plant.rods.method import closed_form_method
-from pcr_mpc.plant.statics.solver import RodSolver
+from ..errors import PCRError
+from ..plant.robot import Robot
+from ..plant.rods.method import closed_form_method
+from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.free_tip import inverse_statics
+from ..plant.statics.solver import RodSolver
 
 Site = tuple[int, int]
 NEIGHBOURS: tuple[Site, ...] = ((1, 0), (0, 1), (-1, 1), (-1, 0), (0, -1), (1, -1))  # counter-clockwise
@@ -187,16 +190,16 @@ def distance_to_reach(robot: Robot, p: np.ndarray, direction: np.ndarray) -> flo
     return float((np.sqrt(along**2 + (REACH * robot.lengths) ** 2 - (arm**2).sum(axis=1)) - along).min())
 
 
-def explore(start: Equilibrium, spacing: float, most: int | None = None) -> Sheet:
+def explore(start: Equilibrium, spacing: float, most: int | None = None, *, progress: bool = True) -> Sheet:
     """All poses of the lattice that stable motion connects with ``start``, or the first ``most`` of them."""
     sheet = make_sheet(start.robot, spacing)
     solver = RodSolver(start.robot, closed_form_method())
     first = min(sheet.tips, key=lambda site: float(np.linalg.norm(sheet.tips[site] - start.p)))
     sheet.poses[first] = inverse_statics(start.robot, sheet.tips[first], guess=start)
     waiting = deque([first])
-    with tqdm(total=most or len(sheet.tips), desc=f"mode {start.mode}", unit="tip") as progress:
+    with tqdm(total=most or len(sheet.tips), desc=f"mode {start.mode}", unit="tip", disable=not progress) as bar:
         while waiting:
-            progress.update()
+            bar.update()
             site = waiting.popleft()
             pose = sheet.poses[site]
             for neighbour in neighbours(site):

@@ -1,0 +1,44 @@
+"""The command of the command line that shows a scene in a browser."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import webbrowser
+from pathlib import Path
+
+from ..control.tuning import Tuning, load_tuning
+from ..loop.controller.own_controller import OwnController
+from ..loop.scene.file import load_scene
+from ..view.server import ViewServer
+from ..view.session import Session
+
+
+def view(options: argparse.Namespace) -> int:
+    """Run `pcr-mpc view`."""
+    scene = load_scene(options.scene)
+    own: Tuning | OwnController | None = None
+    if isinstance(options.controller, str):
+        own = OwnController(options.controller)
+    elif options.controller:
+        own = load_tuning(options.controller)
+    folder = options.out or Path("results") / "view" / scene.name
+    server = ViewServer(
+        lambda: Session(scene, own, options.seed), (options.host, options.port), folder, anywhere=options.anywhere
+    )
+
+    def tell(address: str) -> None:
+        print(f"{scene.name}: {address}\n{scene.name}: whoever has this address moves the robot; Ctrl-C ends it",
+              file=sys.stderr, flush=True)  # fmt: skip
+        if not options.no_browser:
+            webbrowser.open(address)
+
+    print(f"{scene.name}: getting ready", file=sys.stderr, flush=True)
+    try:
+        server.serve(tell)
+    except KeyboardInterrupt:
+        print(f"{scene.name}: ended", file=sys.stderr)
+    if options.json:
+        print(json.dumps({"scene": scene.name, **server.counts}))
+    return 0
