@@ -29,17 +29,19 @@ class Recorder:
     scene : Scene
         As it is then.
     rig : Rig
+    target : ndarray, shape (2,), or None
+        Where the tip is to be then [m].
     seed : int
         Of the measurement noise.
     """
 
-    def __init__(self, scene: Scene, rig: Rig, seed: int) -> None:
+    def __init__(self, scene: Scene, rig: Rig, target: np.ndarray | None, seed: int) -> None:
         self._scene, self._seed = scene, seed
         self._pose = rig.equilibrium()
         self._velocity = rig.x[2:4].copy()
         self._states: list[np.ndarray] = [rig.x.copy()]
         self._applied: list[np.ndarray] = []
-        self._reference: list[np.ndarray] = []
+        self._reference = [_known(target)]
         self._measured: list[np.ndarray] = []
         self._decisions: list[Decision] = []
         self._payloads: list[float] = []
@@ -75,7 +77,7 @@ class Recorder:
             self._began = t - rig.dt
         self._states.append(rig.x.copy())
         self._applied.append(rig.applied.copy())
-        self._reference.append(np.full(2, np.nan) if target is None else target)
+        self._reference.append(_known(target))
         self._payloads.append(rig.plant.payload)
         if rig.force.any() and not self._pulled:
             self.tell(t, "warning", "the tip was pulled by hand: that force is no part of the record")
@@ -97,7 +99,7 @@ class Recorder:
         steps = periods * per
         t = scene.plant.dt * np.arange(steps + 1)
         x, applied = np.array(self._states[: steps + 1]), np.array(self._applied[:steps])
-        reference = np.array([self._reference[0], *self._reference[:steps]])
+        reference = np.array(self._reference[: steps + 1])
         tracked = bool(np.isfinite(reference).all())
         decisions = self._decisions[:periods]
         own = getattr(pilot.controller, "robot", None)
@@ -137,6 +139,10 @@ class Recorder:
         self._events.append({"t": 0.0, "kind": "warning", "message": "the load was changed more than once: the record "
                              f"does not have it; it was {carried.min():.4g} to {carried.max():.4g} kg"})  # fmt: skip
         return None
+
+
+def _known(target: np.ndarray | None) -> np.ndarray:
+    return np.full(2, np.nan) if target is None else target
 
 
 def _recorded(t: np.ndarray, reference: np.ndarray) -> Recorded:

@@ -78,7 +78,7 @@ def _work(pipe: Connection) -> None:
     """The other process."""
     follow_the_parent()
     with suppress(AttributeError, OSError):
-        os.nice(10)  # what is in real time goes before
+        os.nice(5)  # what is in real time goes before
     while True:
         try:
             task, arguments = pipe.recv()

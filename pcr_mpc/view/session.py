@@ -318,7 +318,7 @@ class Session:
         if on and self.recorder is None:
             while self._j:
                 self._step()
-            self.recorder = Recorder(self.scene, self.rig, self._seed)
+            self.recorder = Recorder(self.scene, self.rig, self.target(), self._seed)
         elif not on and self.recorder is not None:
             recorder, self.recorder = self.recorder, None
             try:

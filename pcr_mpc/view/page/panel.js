@@ -4,6 +4,8 @@
 const $ = (id) => document.getElementById(id);
 const RUNGS = { solved: "solved", softened: "limits softened", shifted_plan: "last plan, shifted", lqr: "LQR", hold: "motors held" };
 
+function length(mm) { return mm < 0.1 ? `${(1000 * mm).toFixed(mm < 0.01 ? 1 : 0)} µm` : `${short(mm)} mm`; }
+
 function make(tag, properties = {}, ...children) {
   const element = Object.assign(document.createElement(tag), properties);
   element.append(...children);
@@ -24,10 +26,10 @@ class Panel {
     document.title = `${about.scene} · pcr_mpc`;
     $("title").textContent = `${about.scene} · ${about.robot}`;
     $("figures").replaceChildren();
-    for (const [key, label] of [["error", "from target"], ["rung", "answer"], ["tip", "tip"], ["iterations", "iterations"],
-      ["force", "pull"], ["estimated", "force felt"], ["mode", "mode"], ["load", "load"]]) {
+    for (const [key, label] of [["rung", "answer"], ["tip", "tip"], ["error", "off target"], ["iterations", "iterations"],
+      ["force", "pull"], ["estimated", "felt"], ["mode", "mode"], ["load", "load"]]) {
       this.figures[key] = make("dd", { textContent: "–" });
-      $("figures").append(make("div", {}, make("dt", { textContent: label }), this.figures[key]));
+      $("figures").append(make("div", { className: key }, make("dt", { textContent: label }), this.figures[key]));
     }
     $("bars").replaceChildren();
     this.bars = {};
@@ -89,7 +91,7 @@ class Panel {
     const { about } = this, limits = about.limits;
     $("clock").textContent = `${frame.t.toFixed(2)} s` + (about.live ? `  ${frame.paused ? "paused" : `${(frame.ratio ?? 1).toFixed(2)} ×`}` : "");
     const error = frame.target && 1000 * Math.hypot(frame.p[0] - frame.target[0], frame.p[1] - frame.target[1]);
-    this.write("error", error === null || error === undefined ? "–" : `${short(error)} mm`);
+    this.write("error", error === null || error === undefined ? "–" : length(error));
     const limited = frame.limits && frame.limits.length ? ` (${frame.limits.join(", ")})` : "";
     this.write("rung", frame.rung ? (RUNGS[frame.rung] || frame.rung) + limited : frame.hand ? "by hand" : frame.controller || "–",
       Boolean(frame.rung) && frame.rung !== "solved");
@@ -136,7 +138,7 @@ class Panel {
   setRole(role) {
     this.looking = !role.steers && !role.free;
     const others = role.pages - 1;
-    $("role").textContent = this.looking ? "looking on: another page steers" : others ? `you steer, ${others} look${others === 1 ? "s" : ""} on` : "you steer";
+    $("role").textContent = this.looking ? "looking on: another page steers" : others ? `you steer, ${others} look${others === 1 ? "s" : ""} on` : "";
     $("steer").hidden = !this.looking;
     for (const element of document.querySelectorAll("#bar button, #choices select, #dials input")) element.disabled = this.looking;
   }

@@ -28,7 +28,7 @@ class Strip {
     const all = this.rows.flatMap((row) => row.slice(1)).filter((value) => value !== null);
     const most = Math.max(limit || 0, ...all.map(Math.abs), this.limit ? 0.1 : 1e-3);
     const [low, high] = this.limit ? [-1.15 * most, 1.15 * most] : [0, 1.15 * most];
-    const left = 34, end = this.rows.length ? this.rows[this.rows.length - 1][0] : SPAN;
+    const left = 40, end = this.rows.length ? this.rows[this.rows.length - 1][0] : SPAN;
     const x = (t) => left + (w - left - 4) * (1 - (end - t) / SPAN), y = (value) => h - 4 - (h - 8) * (value - low) / (high - low);
     c.font = "10px system-ui, sans-serif";
     c.textAlign = "right";
@@ -65,5 +65,5 @@ class Strip {
 function short(value) {
   const size = Math.abs(value);
   if (size === 0) return "0";
-  return size >= 100 ? value.toFixed(0) : size >= 1 ? value.toFixed(1) : size >= 0.01 ? value.toFixed(2) : value.toExponential(0);
+  return size >= 100 ? value.toFixed(0) : size >= 1 ? value.toFixed(1) : size >= 0.01 ? value.toFixed(2) : size >= 0.001 ? value.toFixed(3) : value.toExponential(0);
 }
