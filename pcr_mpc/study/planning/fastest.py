@@ -32,6 +32,8 @@ _ENOUGH, _GOOD, _POOR = 0.8, 0.6, 0.3  # of the predicted gain: no correction, a
 _WIDER, _NARROWER = 1.6, 0.4
 _LEAST_GAIN, _LEAST_TRUST = 0.1, 1e-5
 _WIDEST_TRUST = 2.0
+# Which limits a program begins with, of the way to those that a change can reach at all; how often others are added.
+_NEAR_LIMIT, _ADDITIONS, _LP_TOLERANCE = 0.05, 4, 1e-7
 # Force of the rods that may be missing, in units of sum EI/L^2: on the way, and in the end.
 _NEAR, _EXACT = 1e-3, 1e-6
 
@@ -244,9 +246,23 @@ class _Program:
 
     def _solved(self, rest: np.ndarray, trust: float) -> tuple[np.ndarray, float]:
         """Changes of the unknowns, and by how much limits are exceeded then, if shares are rest + slopes @ change."""
-        # Only limits that the change can reach.
         reach = trust * np.abs(self._slopes).sum(axis=1)
-        high, low = rest + reach > self._allowed, self._both & (rest - reach < -self._allowed)
+        # Limits that are near; those that the change turns out to meet as well are added.
+        near = _NEAR_LIMIT * reach
+        high, low = rest + near > self._allowed, self._both & (rest - near < -self._allowed)
+        for _ in range(_ADDITIONS):
+            change, excess = self._with(high, low, rest, trust)
+            share = rest + (self._slopes * change[self._where]).sum(axis=1)
+            most = self._allowed + excess + _LP_TOLERANCE
+            missed_high, missed_low = ~high & (share > most), ~low & self._both & (share < -most)
+            if not (missed_high.any() or missed_low.any()):
+                return change, excess
+            high |= missed_high
+            low |= missed_low
+        return self._with(rest + reach > self._allowed, self._both & (rest - reach < -self._allowed), rest, trust)
+
+    def _with(self, high: np.ndarray, low: np.ndarray, rest: np.ndarray, trust: float) -> tuple[np.ndarray, float]:
+        """Solve the program with these limits from above and from below."""
         count = len(self._gradient)
         slopes = np.concatenate([self._slopes[high], -self._slopes[low]])
         where = np.concatenate([self._where[high], self._where[low]])

@@ -7,6 +7,7 @@ from scipy.interpolate import BSpline, CubicHermiteSpline
 
 _DEGREE = 4  # the motors' acceleration, with b''' in it, is continuous
 _POINTS = 6  # of Gauss, for times
+_LEGENDRE = np.polynomial.legendre.leggauss(_POINTS)
 _NEWTON = 4
 
 
@@ -74,7 +75,7 @@ def places(pace: BSpline, t: np.ndarray) -> np.ndarray:
     t = np.clip(t, 0.0, when[-1])
     at = np.clip(np.searchsorted(when, t, side="right") - 1, 0, len(known) - 2)
     x = CubicHermiteSpline(when, known, np.sqrt(pace(known)))(t)
-    node, weight = np.polynomial.legendre.leggauss(_POINTS)
+    node, weight = _LEGENDRE
     for _ in range(_NEWTON):
         half = (x - known[at]) / 2
         passed = when[at] + half * (pace((known[at] + half)[:, None] + half[:, None] * node) ** -0.5 @ weight)
@@ -83,6 +84,6 @@ def places(pace: BSpline, t: np.ndarray) -> np.ndarray:
 
 
 def _gauss(breaks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    nodes, weights = np.polynomial.legendre.leggauss(_POINTS)
+    nodes, weights = _LEGENDRE
     half = np.diff(breaks)[:, None] / 2
     return (breaks[:-1, None] + half + half * nodes).ravel(), (half * weights).ravel()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -15,10 +17,10 @@ from ...frozen import Frozen
 from ...loop.references.trajectory import Trajectory, sampled
 
 _DEGREE = 7  # a motor's acceleration holds the fourth derivative, which is to have no kinks
-_SAMPLES = 8001  # of the motion whose path is taken
+_SAMPLES = 4001  # of the motion whose path is taken
 _FEWEST, _MOST = 8, 1024  # pieces of the spline
 _SPARE = 0.1  # of the tolerance, which a plain fit may use
-_PENALTIES, _BISECTIONS = (1e-30, 1e-8), 24
+_PENALTIES, _BISECTIONS = (1e-30, 1e-8), 14  # to one part in a hundred
 _STILL = 1e-9  # of the path's length: a step between samples that is none
 
 
@@ -141,20 +143,30 @@ class _Fit:
         self._inner = self._design[:, 1:-1]
         self._ends = np.stack([points[0], points[-1]])
         # Samples may crowd where the motion was slow: each counts for the length that it stands for.
-        self._weights = sparse.diags_array(np.gradient(s) / s[-1])
-        # Fourth derivatives, at more points than the spline has freedom.
-        units = BSpline(self._knots, np.eye(count), _DEGREE)
-        bend = sparse.csc_array(units(np.linspace(0.0, s[-1], 2 * len(breaks)), nu=4) * s[-1] ** 4 / len(breaks))
-        self._bend, self._bend_ends = bend[:, 1:-1], bend[:, [0, count - 1]]
+        weighted = self._inner.T @ sparse.diags_array(np.gradient(s) / s[-1])
+        rest = points - self._design[:, [0, count - 1]] @ self._ends
+        self._gram, self._right = weighted @ self._inner, weighted @ rest
+
+    @cached_property
+    def _roughness(self) -> tuple[Any, np.ndarray]:
+        """Gram matrix of fourth derivatives, at more points than the spline has freedom, and its right-hand side."""
+        count, length = self._design.shape[1], self._s[-1]
+        units, pieces = BSpline(self._knots, np.eye(count), _DEGREE), count - _DEGREE
+        bend = sparse.csc_array(units(np.linspace(0.0, length, 2 * pieces + 2), nu=4) * length**4 / (pieces + 1))
+        inner = bend[:, 1:-1]
+        return inner.T @ inner, -(inner.T @ (bend[:, [0, count - 1]] @ self._ends))
 
     def __call__(self, penalty: float) -> tuple[BSpline, np.ndarray]:
         """Spline, and its distances from the points [m]."""
-        rest = self._points - self._design[:, [0, self._design.shape[1] - 1]] @ self._ends
-        matrix = self._inner.T @ self._weights @ self._inner + penalty * self._bend.T @ self._bend
-        right = self._inner.T @ (self._weights @ rest) - penalty * (self._bend.T @ (self._bend_ends @ self._ends))
+        matrix, right = self._gram, self._right
+        if penalty > 0.0:
+            gram, towards = self._roughness
+            matrix, right = matrix + penalty * gram, right + penalty * towards
         solved = splu(matrix.tocsc()).solve(np.ascontiguousarray(right))
-        spline = BSpline(self._knots, np.concatenate([self._ends[:1], solved, self._ends[1:]]), _DEGREE)
-        return spline, np.linalg.norm(spline(self._s) - self._points, axis=1)
+        coefficients = np.concatenate([self._ends[:1], solved, self._ends[1:]])
+        return BSpline(self._knots, coefficients, _DEGREE), np.linalg.norm(
+            self._design @ coefficients - self._points, axis=1
+        )
 
 
 def fitted(x: np.ndarray, y: np.ndarray, breaks: np.ndarray, degree: int, flat: int = 1) -> BSpline:
