@@ -231,8 +231,8 @@ def test_bad_arguments_are_named(pair, centre):
 
 def test_inertia_that_is_not_finite_is_an_error(pair, centre, monkeypatch):
     plant = started(pair, centre, state(centre))
-    graph = plant._condensed._graph
+    graph = plant._rods._condensed._graph
     outputs = [graph.outputs[0], np.full_like(graph.outputs[1], np.nan)]
-    monkeypatch.setattr(plant._condensed, "_graph", MagicMock(inputs=graph.inputs, outputs=outputs))
+    monkeypatch.setattr(plant._rods._condensed, "_graph", MagicMock(inputs=graph.inputs, outputs=outputs))
     with pytest.raises(ConvergenceError, match="no finite derivative"):
         plant.mass(centre.p + 1e-3, centre.q)

@@ -66,8 +66,8 @@ def test_the_step_s_model_may_be_taken_away_after_a_step(pair, centre, x0):
         ends.append(x)
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-12)
     # The slow way leaves its pose with the solver, not with the graph of the step.
-    assert plants[1]._at is not plants[1]._quick_at
-    assert plants[0]._at is plants[0]._quick_at
+    assert plants[1]._rods.at is not plants[1]._quick_at
+    assert plants[0]._rods.at is plants[0]._quick_at
 
 
 def test_payload_is_carried_and_taken_away(plant, x0, centre):

@@ -131,7 +131,7 @@ def test_a_snap_that_is_undone_is_not_kept(pair, centre):
     plant = Plant(pair, on_snap="jump")
     wind_up(plant, centre, 20, turn=0.3 * WINDING)
     assert plant.snaps == []
-    solver = plant._solver
+    solver = plant._rods.solver
     solver.move(centre.p, centre.q + [WINDING, 0.0])
     assert len(solver.snaps) == 1
     solver.go_back()

@@ -9,7 +9,8 @@ import casadi as ca
 
 from ..buffered import BufferedFunction, graph_cache, per_thread
 from ..errors import checked_number, checked_vector
-from ..plant.motion.plant import DERIVATIVE_ACCURACY, Plant
+from ..plant.motion.followed_rods import DERIVATIVE_ACCURACY
+from ..plant.motion.plant import Plant
 from .linear_model import LinearModel
 
 # Taylor order and squarings of the matrix exponential: better than 1e-9 up to K dt^2/m and (c dt/m)^2 of 1000.

@@ -16,7 +16,8 @@ from ..loop.run.run import Run
 from ..loop.run.simulate import simulate
 from ..loop.scene.scene import Scene
 from ..methods import METHODS
-from ..plant.motion.plant import DERIVATIVE_ACCURACY, Plant
+from ..plant.motion.followed_rods import DERIVATIVE_ACCURACY
+from ..plant.motion.plant import Plant
 from .machine import machine, versions
 from .overhead import call_overhead
 from .stopwatch import WARM_UP, Times, distribution, measure

@@ -7,25 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import ConvergenceError, PCRError, UnstableError, checked_number, checked_vector
-from ...frozen import Remade, read_only, set_once
+from ...errors import PCRError, checked_number, checked_vector
+from ...frozen import Remade, set_once
 from ..robot import Robot
 from ..rods.numbers import Kind
 from ..statics.equilibrium import Equilibrium
-from ..statics.held_tip import checked_shooting, make_solver
+from ..statics.held_tip import checked_shooting
 from ..statics.solver import RodSolver, Snap
 from ..statics.state import RobotState
-from ..statics.weight import CondensedWeight
 from .choices import ON_SNAP, checked_choices
+from .followed_rods import FollowedRods
 from .integrators import INTEGRATORS
-from .mass_matrix import CondensedMass, MassMatrix, tip_mass
+from .mass_matrix import MassMatrix
 from .modal_step import ModalStep
 from .quick_step import QuickStep
-from .step_graph import LARGEST_DRIFT, PREDICTOR_ACCURACY, StepModel
+from .step_graph import PREDICTOR_ACCURACY, StepModel
 from .step_limit import longest_step
-
-# Residual of the statics at which derivatives may be taken for a linear model; their error is of this size.
-DERIVATIVE_ACCURACY = 1e-6
 
 
 @set_once(
@@ -124,25 +121,24 @@ class Plant(Remade):
         self.n_states = 4 + robot.n_rods
         self._modal = ModalStep(rods, int(modes)) if inertia == "full" else None
         self._advance = self._modal or INTEGRATORS[integrator](robot.n_rods)
-        self._mass_moves = inertia in ("condensed", "full")
         self.shooting = checked_shooting(segments, steps, scheme)
-        self._solver = make_solver(rods, method, self.shooting, snapping=on_snap == "jump", compiled=compiled)
-        self._sag = CondensedWeight(robot) if weight == "condensed" else None
-        self._at: list[float] | None = None
-        self._accuracy = 0.0  # of the derivatives there
-        self._stiffness: np.ndarray | None = None  # at the last reset
-        self._mass = tip_mass(robot)
-        self._mass_at: list[float] | None = None
+        self._rods = FollowedRods(
+            robot,
+            rods,
+            method,
+            self.shooting,
+            inertia=inertia,
+            weight=weight,
+            snapping=on_snap == "jump",
+            compiled=compiled,
+        )
         self.payload = 0.0
         self._tip_weight = robot.tip_weight
-        self._condensed: CondensedMass | None = None
         self.step_model: StepModel | None = None
-        if isinstance(self._solver, RodSolver):
-            of_rods = self._solver.method
+        if isinstance(self._rods.solver, RodSolver):
+            of_rods = self._rods.solver.method
             kind = Kind(robot.n_rods, of_rods.layout)
             self.numbers = kind.pack(robot)
-            if inertia != "none":
-                self._condensed = CondensedMass(rods, of_rods)
             if inertia != "full":
                 self.step_model = StepModel(kind, of_rods, integrator, inertia, weight, dt)
         self._quick: QuickStep | None = None
@@ -158,21 +154,10 @@ class Plant(Remade):
         x = checked_vector("x", x, self.n_states)
         p, q = x[:2], x[4:]
         self.robot.require_reachable(p)
-        self._at = None
-        if self._quick is not None:
-            self._quick.hand_over()
         self._take(0.0)
-        if guess is None:
-            self._solver.start(p, q)
-        else:
-            self._solver.start(guess.p, guess.q, guess.nodes)
-        self._go(p, q, None)
-        self._stiffness = self._solver.jacobians()[0].copy()
+        self._rods.start(p, q, guess)
         if self._modal is not None:
             self._modal.forget()
-        if self.inertia == "constant":
-            assert self._condensed is not None
-            self._mass = self._condensed(self._unknowns(), q)[0], self._mass[1]
 
     def carry(self, payload: float, x: Any) -> np.ndarray:
         """Let the tip carry a payload besides its own mass from state x on; a `reset` takes it away.
@@ -207,10 +192,8 @@ class Plant(Remade):
     def _take(self, payload: float) -> None:
         if payload == self.payload:
             return
-        mass, slopes = self._mass
-        n = self.robot.n_rods
-        self._mass = read_only(mass + np.diag([payload - self.payload] * 2 + [0.0] * n)), slopes
-        self.__dict__["payload"], self._mass_at = payload, None
+        self._rods.carry(payload)
+        self.__dict__["payload"] = payload
         self._tip_weight = self.robot.tip_weight + payload * np.array(self.robot.gravity)
         if self.step_model is not None:
             kind = self.step_model.kind
@@ -230,21 +213,17 @@ class Plant(Remade):
     @property
     def snaps(self) -> list[Snap]:
         """Snaps since the reset, in order."""
-        return self._solver.snaps
+        return self._rods.solver.snaps
 
     @property
     def residual(self) -> float:
         """Residual of the rods at the last pose that was solved, added up over them; not for single shooting."""
-        if not isinstance(self._solver, RodSolver):
-            raise ValueError(f"method {self.method} keeps no residual")
-        if self._quick is not None:
-            self._quick.hand_over()
-        return float(self._solver.state.residual)
+        return float(self._rods.keeping("residual").state.residual)
 
     @property
     def rungs(self) -> dict[str, int]:
         """How many poses each rung of the solver's ladder has solved (see `RodSolver`)."""
-        return dict(self._solver.rungs)
+        return dict(self._rods.solver.rungs)
 
     def step(self, x: Any, u: Any, f_ext: Any = (0.0, 0.0)) -> np.ndarray:
         """Advance by one time step with the motor rates held.
@@ -286,26 +265,19 @@ class Plant(Remade):
     @property
     def record(self) -> np.ndarray:
         """All about the rods at the last pose that was solved, in one vector (see `recall`)."""
-        if not isinstance(self._solver, RodSolver):
-            raise ValueError(f"method {self.method} keeps no record")
-        if self._quick is not None:
-            self._quick.hand_over()
-        return self._solver.state.record
+        return self._rods.keeping("record").state.record
 
     def recall(self, record: np.ndarray) -> None:
         """Put the rods back to a pose whose ``record`` was copied."""
-        assert isinstance(self._solver, RodSolver)
-        if self._quick is not None:
-            self._quick.hand_over()
-        self._at = None
-        self._solver.recall(record)
+        self._rods.recall(record)
 
     def _step_too_long(self) -> str | None:
         """Whether the integrator is unstable on the stiffness of the rods at the reset, in words."""
         # Not where they are: a tip that was thrown away has pulled them taut.
-        if self._stiffness is None:
+        stiffness, mass = self._rods.stiffness, self._rods.last_mass()[:2, :2]
+        if stiffness is None:
             return None
-        longest, omega = longest_step(self.integrator, self._stiffness, self._mass[0][:2, :2], self.robot.drag)
+        longest, omega = longest_step(self.integrator, stiffness, mass, self.robot.drag)
         if self.dt < longest:
             return None
         return (
@@ -316,41 +288,34 @@ class Plant(Remade):
     def memory(self, x: np.ndarray) -> np.ndarray:
         """Return what a `step_graph` of ``step_model`` starts from at state x, following the branch."""
         assert self.step_model is not None
-        assert isinstance(self._solver, RodSolver)
         force, mass = self.force_and_mass(x[:2], x[4:])
-        return self.step_model.memory(self._solver.state.start, force, mass)
+        return self.step_model.memory(self._rods.keeping("record").state.start, force, mass)
 
     def _step_quickly(self, x: np.ndarray, u: np.ndarray, f_ext: np.ndarray) -> np.ndarray | None:
         """Step in one call, or None where that is not possible."""
         if self.step_model is None:
             return None
         if self._quick is None or self._quick.model is not self.step_model:
-            assert isinstance(self._solver, RodSolver)
-            if self._quick is not None:
-                self._quick.hand_over()
-                self._quick_at = None
-            self._quick = QuickStep(self.step_model, self._solver, self.numbers, compiled=self.compiled)
+            solver = self._rods.keeping("record")
+            self._quick_at = None
+            self._quick = self._rods.ahead = QuickStep(self.step_model, solver, self.numbers, compiled=self.compiled)
         at = x.tolist()
         del at[2:4]
-        if self._at is not self._quick_at or at != self._at:
+        if self._rods.at is not self._quick_at or at != self._rods.at:
             self._quick.load(self.memory(x))
-            self._quick_at = self._at
+            self._quick_at = self._rods.at
         end = self._quick(x, u, f_ext)
         if end is None:
             return None
         at = end.tolist()
         del at[2:4]
-        self._at = self._quick_at = at
-        self._accuracy = PREDICTOR_ACCURACY
+        self._rods.at = self._quick_at = at
+        self._rods.accuracy = PREDICTOR_ACCURACY
         return end.copy()
 
     def force(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         """F at (p, q), following the branch [N]; the tip is at rest where it is the tip's weight plus F_ext."""
-        q = np.asarray(q, dtype=float)
-        self._go(np.asarray(p, dtype=float), q, PREDICTOR_ACCURACY)
-        if self._sag is None:
-            return self._solver.force()
-        return read_only(self._solver.force() + self._sag.first(self._unknowns(), q)[1][:2])
+        return self._rods.force(p, q)
 
     def force_and_jacobians(
         self, p: np.ndarray, q: np.ndarray, accuracy: float | None = None
@@ -359,22 +324,14 @@ class Plant(Remade):
 
         ``accuracy`` bounds the residual of the iterate at which K and G were taken; None: at the solution.
         """
-        self._go(p, q, accuracy)
-        k, g = self._solver.jacobians()
-        if self._sag is None:
-            return self._solver.force(), k, g
-        slope, curvature = self._sag.first(self._unknowns(), q)[1], self._sag.second(self._unknowns(), q)
-        return self._solver.force() + slope[:2], k + curvature[:2, :2], g + curvature[:2, 2:]
+        return self._rods.force_and_jacobians(p, q, accuracy)
 
     def rods(self, p: np.ndarray, q: np.ndarray) -> RobotState:
         """Unknowns, loads and derivatives of all rods at (p, q), following the branch; not for single shooting.
 
         A condensed weight, which bends no rod, is no part of them. Valid until the plant moves on.
         """
-        if not isinstance(self._solver, RodSolver):
-            raise ValueError(f"method {self.method} keeps no unknowns of the rods")
-        self._go(p, q, DERIVATIVE_ACCURACY)
-        return self._solver.state
+        return self._rods.state(p, q)
 
     def mass(self, p: np.ndarray, q: np.ndarray) -> MassMatrix:
         """Mass matrix at (p, q), following the branch, for the velocities w = [p', q'].
@@ -386,15 +343,11 @@ class Plant(Remade):
         slopes : ndarray, shape ((2 + n)^2, 2 + n)
             d vec(M) / d(p, q), columns of M stacked; zero where the inertia is "none" or "constant".
         """
-        return self.force_and_mass(p, q)[1] if self._mass_moves else self._mass
+        return self._rods.mass(p, q)
 
     def force_and_mass(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, MassMatrix]:
         """`force` and `mass` at the same pose."""
-        force = self.force(p, q)
-        if self._mass_moves and self._mass_at is not self._at:
-            assert self._condensed is not None
-            self._mass, self._mass_at = self._condensed(self._unknowns(), q, self.payload), self._at
-        return force, self._mass
+        return self._rods.force_and_mass(p, q)
 
     def tip_velocity(self, x: Any, u: Any) -> np.ndarray:
         """Velocity p' of the tip at state x while the motors turn at the rates u, shape (2,) [m/s]."""
@@ -405,45 +358,7 @@ class Plant(Remade):
     def equilibrium(self, x: Any) -> Equilibrium:
         """Everything about the rods at state x, following the branch."""
         x = checked_vector("x", x, self.n_states)
-        self._go(x[:2], x[4:], None)
-        eq = self._solver.equilibrium(x[:2], x[4:])
-        return eq if self._sag is None else self._sag.added(eq, self._unknowns())
-
-    def _unknowns(self) -> np.ndarray:
-        assert isinstance(self._solver, RodSolver)
-        return self._solver.state.unknowns
-
-    def _go(self, p: np.ndarray, q: np.ndarray, derivatives: float | None) -> None:
-        at, accuracy = [*p.tolist(), *q.tolist()], derivatives or 0.0
-        if self._quick is not None:
-            self._quick.hand_over()
-        if at == self._at and self._accuracy <= accuracy:
-            return
-        self._at = None
-        try:
-            self._solver.move(p, q, derivatives=derivatives)
-        except ConvergenceError:
-            self.robot.require_reachable(p)  # the plainer reason, if it is the reason
-            raise
-        drift = self._solver.drift()
-        if not drift <= LARGEST_DRIFT:
-            self._solver.go_back()
-            raise ConvergenceError(
-                f"the rods at p = {p} m, q = {q} rad are too taut for this discretisation: their invariant drifts by "
-                f"{drift:.1e} (at most {LARGEST_DRIFT:.0e}); use more segments or steps",
-                residual=drift,
-                iterations=0,
-                last=None,
-            )
-        unstable = self._solver.unstable_rods()
-        if unstable:
-            self._solver.go_back()
-            raise UnstableError(
-                f"rod {unstable[0]} is unstable at p = {p} m, q = {q} rad: it would snap to another shape; "
-                "slow down or keep away from this pose",
-                rod=unstable[0],
-            )
-        self._at, self._accuracy = at, accuracy
+        return self._rods.equilibrium(x[:2], x[4:])
 
 
 __all__ = ["INTEGRATORS", "ON_SNAP", "Plant"]

@@ -15,7 +15,8 @@ from ...loop.demand.feed_forward import InverseDynamics, feed_forward
 from ...loop.hardware.camera import IDEAL as IDEAL_CAMERA
 from ...loop.parts.assembled import make_law, make_model, make_observer, motor_limits, pull
 from ...loop.scene.scene import Scene
-from ...plant.motion.plant import DERIVATIVE_ACCURACY, Plant
+from ...plant.motion.followed_rods import DERIVATIVE_ACCURACY
+from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
 from .linear_controller import Believed, Feedback, feedback_of, linear_controller
