@@ -78,6 +78,13 @@ def test_laps_are_where_the_path_comes_round():
         assert rate[1] == pytest.approx(1 / duration)
         assert own[0] < 0.2
     assert laps_of(eight, 2.9).count == 0
+    # Of two laps one is whole at full speed, and 0.75 of the other; with longer blends less than half is left.
+    twice = Blended(Circle((0.0, 0.25), 0.02, period=0.8), repeat=2, start=0.2, end=0.2)
+    laps = laps_of(twice, 1.8)
+    assert (laps.count, laps.rest) == (1, pytest.approx(0.6))
+    assert laps.judged(0.01).tolist() == [20, 100, 160]
+    assert laps_of(twice, 1.55).judged(0.01).tolist() == [20, 100]  # which ends before
+    assert laps_of(replace(twice, start=0.4, end=0.5), 2.1).judged(0.01).tolist() == [40, 120]
     assert laps_of(Blended(Circle((0.0, 0.25), 0.02, period=0.8)), 5.0) is None
     assert laps_of(None, 5.0) is None
 

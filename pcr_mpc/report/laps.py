@@ -26,17 +26,17 @@ def plot_laps(run: Run, path: Path) -> None:
     Raises
     ------
     ValueError
-        There is no whole lap in it.
+        There is no lap in it.
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.0), layout="constrained")
     left.set_title(f"{run.scene.name}, seed {run.seed}")
     laps, errors = run.laps(), run.lap_errors()
     if laps is None or not len(errors):
         plt.close(figure)
-        raise ValueError(f"{path}: no whole lap was run")
+        raise ValueError(f"{path}: no lap was run at full speed")
     draw_errors(left, [errors], BLUE, run.controller)
-    edges = laps.edges(run.scene.period) * run.steps_per_period
-    for lap, colour, name in ((0, GREY, "first"), (laps.count - 1, BLUE, "last")):
+    edges = laps.judged(run.scene.period) * run.steps_per_period
+    for lap, colour, name in ((0, GREY, "first"), (len(errors) - 1, BLUE, "last")):
         at = slice(edges[lap], edges[lap + 1])
         right.plot(run.t[at] - run.t[edges[lap]], 1e3 * run.error[at], color=colour, label=f"{name} lap")
     right.legend(fontsize=9)

@@ -134,11 +134,12 @@ class Run(Frozen):
         return laps_of(self.scene.trajectory, float(self.t[-1]))
 
     def lap_errors(self) -> np.ndarray:
-        """RMS distance of the tip from the reference in each whole lap at full speed, shape (laps,) [m]."""
+        """RMS distance of the tip from the reference in each lap at full speed, shape (laps,) [m]: whole laps, and what
+        is left of the last one until the path is slowed down, if that is half of it."""
         laps = self.laps()
         if laps is None:
             return np.empty(0)
-        edges = laps.edges(self.scene.period) * self.steps_per_period
+        edges = laps.judged(self.scene.period) * self.steps_per_period
         return np.array([np.sqrt(np.mean(self.error[a:b] ** 2)) for a, b in pairwise(edges.tolist())])
 
     def limit_violations(self) -> int:
