@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc import ConvergenceError, forward_statics, inverse_statics, load_scene
+from pcr_mpc import ConvergenceError, forward_statics, inverse_statics, load_scene, make_controller, simulate
 from pcr_mpc.errors import NoRungError
+from pcr_mpc.loop.hardware.motors import Motors
+from pcr_mpc.loop.parts.controllers import Replay
 from pcr_mpc.loop.scene.settings import Need, PlantSettings
 from pcr_mpc.report.choice_tables import choice_record, choice_table
 from pcr_mpc.study.choice import Bench, Measured, apart, choose, lowest
@@ -116,11 +118,12 @@ def test_what_the_yardstick_may_be_off_counts(release):
 @pytest.mark.parametrize(
     ("name", "sizes"),
     [
-        ("hold_slow", (4, 1, 1, 1)),
-        ("vertical", (4, 3, 1, 1)),
-        ("curved_rods", (4, 1, 2, 1)),
-        ("near_straight", (4, 3, 2, 1)),
-        ("payload", (4, 1, 1, 2)),
+        ("hold_slow", (4, 1, 1, 1, 1)),
+        ("vertical", (4, 3, 1, 1, 1)),
+        ("curved_rods", (4, 1, 2, 1, 1)),
+        ("near_straight", (4, 3, 2, 1, 1)),
+        ("payload", (4, 1, 1, 2, 1)),
+        ("servo", (4, 1, 1, 1, 2)),
     ],
 )
 def test_a_scene_has_the_ladders_of_its_effects(name, sizes):
@@ -287,3 +290,56 @@ def test_table_and_record(release, choice):
 def test_a_scene_without_need_is_refused():
     with pytest.raises(ValueError, match=r"lemniscate states no need; give it a \[need\] table"):
         choose(load_scene(SCENES / "lemniscate.toml"))
+
+
+# --- motors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def lagging():
+    """Massless rods on motors that lag, with play and enough torque."""
+    scene = load_scene(SCENES / "lemniscate.toml")
+    motors = Motors(time_constant=0.01, backlash=0.004, saturated=True)
+    massless = replace(scene.robot, rods=tuple(replace(rod, line_density=0.0) for rod in scene.robot.rods))
+    return replace(scene, robot=massless, duration=0.4, motors=motors, need=Need(1e-4, **ANY_TIME))
+
+
+def test_motors_are_an_effect_like_the_others(lagging):
+    """What they cost is measured on the scene's motion; they are left out where what is needed allows."""
+    found = choose(lagging)
+    assert [levels(one.rung)["motors"] for one in found.physics] == ["ideal", "as_built"]
+    ideal, built = found.physics
+    assert built.error == 0.0
+    # In the simulator itself, motors of the same commands with and without.
+    runs = [simulate(each, each.make_plant(), Replay(make_run(lagging).u)) for each in
+            (lagging, replace(lagging, motors=None))]  # fmt: skip
+    apart = np.linalg.norm(runs[0].x[:, :2] - runs[1].x[:, :2], axis=1).max()
+    assert ideal.error == pytest.approx(apart, rel=0.05)
+    said = found.estimates.of_level("motors", "ideal")
+    assert set(said) == {"motor lag", "backlash", "torque limit"}
+    assert 0.3 < sum(each.error for each in said.values()) / ideal.error < 5.0
+    assert said["torque limit"].error == 0.0
+    assert found.chosen.rung.motors == "as_built"
+    assert "motors: ideal -> as_built" in choice_table(found)
+    need = replace(lagging.need, tip_accuracy=2.0 * ideal.error)
+    _, rough = lowest(lagging, need, found.physics, lambda rung: replace(ideal, rung=rung))
+    assert rough.rung.motors == "ideal"
+
+
+def make_run(scene):
+    return simulate(scene, scene.make_plant(), make_controller(scene))
+
+
+def test_a_motor_that_lacks_torque_is_estimated(lagging):
+    weak = replace(lagging, robot=replace(lagging.robot, torque_limit=0.7))
+    start = lagging.start()
+    assert Estimates(weak, start).of_level("motors", "ideal")["torque limit"].error > 1e-3
+    assert ladders(replace(lagging, motors=Motors()))["motors"] == ("as_built",)
+
+
+def test_motors_that_are_left_out_change_no_bit(lagging):
+    """A plant with ideal motors is that of a scene without any."""
+    short = replace(lagging, duration=0.1)
+    ideal = replace(short, plant=replace(short.plant, motors="ideal"))
+    assert make_run(ideal).hash() == make_run(replace(short, motors=None)).hash()
+    assert make_run(short).hash() != make_run(ideal).hash()

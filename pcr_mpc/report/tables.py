@@ -110,7 +110,7 @@ def _need_lines(rung: dict[str, Any] | None, need: dict[str, Any] | None) -> lis
         return []
     physics = "another engine" if rung is None else ", ".join(
         f"{name} {rung[name]}" for name in ("inertia", "weight", "rods", "payload") if rung[name]
-    )  # fmt: skip
+    ) + (", motors ideal" if rung.get("motors") == "ideal" else "")  # fmt: skip
     tip = f"tip to {need['tip_accuracy_mm']:g} mm: "
     tip += f"within {need['tip_error_mm']:.2g} mm" if need["verified"] else "not verified; see pcr-mpc choose"
     slow = [name for name in ("plant_step", "control_step") if not need[f"{name}_met"]]

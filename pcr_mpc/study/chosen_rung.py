@@ -26,7 +26,7 @@ _ENTRY = re.compile(r"""\s*(?P<key>[\w-]+|"[^"]*"|'[^']*')\s*=\s*("[^"]*"|'[^']*
 _OURS = (
     "# the lowest rung that meets the need, by pcr-mpc choose --write",
     "# s",
-    r"# against ((inertia|weight|rods|payload) \w+(, )?)*",
+    r"# against ((inertia|weight|rods|payload|motors) \w+(, )?)*",
     "# mm, largest over the duration",
     "# mm of it, for what the yardstick leaves out",
     "# of robot, motion, need and rung: tells whether this still holds",

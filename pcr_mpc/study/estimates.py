@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import PCRError
+from ..loop.hardware.motors import Motors
 from ..loop.scene.scene import Scene
 from ..loop.scene.settings import PlantSettings
 from ..plant.motion.plant import Plant
@@ -62,6 +63,7 @@ class Estimates:
         robot, mass = scene.robot, scene.robot.tip_mass
         speed = float(np.linalg.norm(scene.start_velocity))
         self._free = scene.trajectory is None
+        self._speed = 0.0  # of the tip, as the motors move it
         k = np.linalg.eigvalsh(pose.dforce_dp)
         path = [pose]
         if scene.trajectory is None:
@@ -75,6 +77,7 @@ class Estimates:
                 path.append(inverse_statics(robot, p, guess=path[-1]))
             fine = scene.trajectory(np.arange(0.0, scene.duration, scene.period))
             self._acceleration = float(np.linalg.norm(fine[:, 2], axis=1).max())
+            self._speed = float(np.linalg.norm(fine[:, 1], axis=1).max())
         stiffnesses = np.array([np.linalg.eigvalsh(eq.dforce_dp) for eq in path])
         self._k = float(max(stiffnesses[:, 0].min(), 1e-9 * k[1]))
         self.slowest, self.fastest = math.sqrt(self._k / mass), math.sqrt(float(stiffnesses.max()) / mass)
@@ -163,7 +166,31 @@ class Estimates:
             return {
                 "payload": Estimate(error, f"{mass:g} kg are accelerated and lifted by nobody: 2 m (a + g)/k, least k")
             }
+        if ladder == "motors" and level == "ideal" and scene.motors is not None:
+            return self._motors(scene.motors)
         return {}
+
+    def _motors(self, motors: Motors) -> dict[str, Estimate]:
+        """Of motors that do what they are told at once: a tip that is not late, never in the play, always moved."""
+        found = {}
+        turned = [np.linalg.solve(eq.dforce_dp, eq.dforce_dq) for eq in self._path]
+        if motors.time_constant:
+            error = _SUDDEN * motors.time_constant * self._speed
+            found["motor lag"] = Estimate(error, f"the tip comes T later: 2 T v, v up to {1e3 * self._speed:.2g} mm/s")
+        if motors.backlash:
+            error = _SUDDEN * motors.backlash / 2 * max(float(np.abs(way).sum(axis=1).max()) for way in turned)
+            found["backlash"] = Estimate(error, f"{motors.backlash / 2:.2g} rad to either side: 2 K^-1 G dq")
+        if motors.saturated:
+            most, limit, error = 0.0, self._scene.robot.torque_limit, 0.0
+            for eq, way in zip(self._path, turned, strict=True):
+                torque = np.abs(eq.motor_torque)
+                most = max(most, float(torque.max()))
+                short = np.maximum(torque - limit, 0.0) / np.abs(eq.dtorque_dq)
+                error = max(error, float(np.linalg.norm(way @ short)))
+            found["torque limit"] = Estimate(
+                error, f"up to {most:.2g} of {limit:.2g} N m are needed: K^-1 G dq, dq = dtau/(dtau/dq)"
+            )
+        return found
 
     def _as_built(self) -> dict[str, Estimate]:
         robot, forces = self._scene.robot, self._rod_forces()

@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import product
 
+from ..loop.hardware.motors import IDEAL
 from ..loop.scene.scene import Scene
-from ..loop.scene.settings import PAYLOADS, RODS, PlantSettings
+from ..loop.scene.settings import MOTORS, PAYLOADS, RODS, PlantSettings
 from ..plant.rods.inertia import INERTIAS
 from ..plant.statics.weight import WEIGHTS
 
@@ -20,6 +21,7 @@ STEPS_PER_PERIOD = (5, 10, 20, 40)
 FORCES_PER_STEP = {"semi_implicit_euler": 1, "velocity_verlet": 1, "rk4": 4, "gauss": 1}
 # Segments, steps in each and scheme of multiple shooting: time of a force, relative. The last is as good as exact.
 SHOOTINGS = {(4, 2, "rk4"): 1.0, (4, 1, "rk8"): 1.5, (8, 1, "rk8"): 2.5}
+LADDERS = "inertia", "weight", "rods", "payload", "motors"
 BEST_SHOOTING = list(SHOOTINGS)[-1]
 
 
@@ -32,12 +34,13 @@ def ladders(scene: Scene) -> dict[str, tuple[str, ...]]:
         "weight": WEIGHTS if heavy and any(robot.gravity) else WEIGHTS[:1],
         "rods": RODS if robot.plain() != robot else RODS[-1:],
         "payload": PAYLOADS if scene.payload is not None else PAYLOADS[-1:],
+        "motors": MOTORS if scene.motors not in (None, IDEAL) else MOTORS[-1:],
     }
 
 
 def levels(rung: PlantSettings) -> dict[str, str]:
     """Level of a rung on each ladder."""
-    return {name: str(getattr(rung, name)) for name in ("inertia", "weight", "rods", "payload")}
+    return {name: str(getattr(rung, name)) for name in LADDERS}
 
 
 def named(scene: Scene, rung: PlantSettings) -> str:
@@ -56,14 +59,14 @@ def all_physics(scene: Scene, dt: float) -> list[PlantSettings]:
     """Every combination of levels, lowest first, each with the best discretisation at time step ``dt`` [s]."""
     found = []
     for chosen in product(*ladders(scene).values()):
-        inertia, weight, rods, payload = chosen
+        inertia, weight, rods, payload, motors = chosen
         plain = rods == RODS[0] or scene.robot.plain() == scene.robot
         segments, steps, scheme = BEST_SHOOTING
         rung = PlantSettings(
             method="closed_form" if plain and weight != "exact" else "multiple_shooting",
             segments=segments, steps=steps, scheme=scheme,
             integrator="gauss" if inertia == "full" else "rk4", dt=dt, on_snap="raise",
-            inertia=inertia, weight=weight, rods=rods, payload=payload,
+            inertia=inertia, weight=weight, rods=rods, payload=payload, motors=motors,
         )  # fmt: skip
         found.append(rung)
     return sorted(found, key=lambda rung: height(scene, rung))

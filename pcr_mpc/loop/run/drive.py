@@ -13,6 +13,7 @@ from ...plant.statics.equilibrium import Equilibrium
 from ..hardware.lag import Lag
 from ..hardware.motors import IDEAL, Motors
 from ..scene.scene import Scene
+from ..scene.settings import MOTORS
 
 _SAME_STALL = 0.1  # s, within which a motor that is held back again tells nothing new
 
@@ -120,6 +121,6 @@ class Drive:
 
 def drive_of(scene: Scene, dt: float, pose: Equilibrium) -> Drive | None:
     """Motors of a scene for a plant with step dt [s]; None: they follow their commands at once."""
-    if scene.motors is None or scene.motors == IDEAL:
+    if scene.motors is None or scene.motors == IDEAL or scene.plant.motors == MOTORS[0]:
         return None
     return Drive(scene.motors, scene.robot.plain() if scene.plant.rods == "plain" else scene.robot, dt, pose)

@@ -20,6 +20,7 @@ from ...toml_table import Table
 
 RODS = ("plain", "as_built")
 PAYLOADS = ("ignored", "carried")
+MOTORS = ("ideal", "as_built")
 # Least 1 - lambda / lambda_c of a rod, and least eigenvalue of K in units of sum EI/L^3, that a controller leaves.
 _LEAST_ROD_MARGIN, _LEAST_STIFFNESS = 0.05, 1.0
 _NEEDS = ("tip_accuracy", "plant_step", "control_step")  # of the simulation
@@ -37,6 +38,8 @@ class PlantSettings:
     rods : {"plain", "as_built"}
         Without or with curvature at rest, stiffness along the rods and stretch.
     payload : {"ignored", "carried"}
+    motors : {"ideal", "as_built"}
+        Whether they follow their commands at once, or as the scene's `Motors` do.
     """
 
     method: str
@@ -50,6 +53,7 @@ class PlantSettings:
     weight: str | None = None
     rods: str = "as_built"
     payload: str = "carried"
+    motors: str = "as_built"
 
     def make(self, robot: Robot) -> Plant:
         """Build the plant of a robot; errors as `Plant`."""
@@ -158,6 +162,7 @@ def read_plant(table: Table, robot: Robot) -> PlantSettings:
         weight=table.text("weight", None, choices=WEIGHTS),
         rods=rods,
         payload=table.text("payload", PAYLOADS[-1], choices=PAYLOADS),
+        motors=table.text("motors", MOTORS[-1], choices=MOTORS),
     )
     if (plant.inertia == "full") != (plant.integrator == "gauss"):
         raise table.fail("integrator", f"is {plant.integrator}: inertia 'full' needs 'gauss', and only it does")

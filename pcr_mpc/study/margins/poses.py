@@ -152,7 +152,7 @@ class LinearLoops:
         plant.reset(pose.x, pose.pose)
         if pose.payload and scene.plant.payload == "carried":
             plant.carry(pose.payload, pose.x)
-        lag = 0.0 if scene.motors is None else scene.motors.time_constant
+        lag = 0.0 if scene.motors is None or scene.plant.motors == "ideal" else scene.motors.time_constant
         return LinearLoop(
             pose.t, pose.x[:2].copy(), linear_plant(plant, pose.x), pose.controllers, scene.period,
             scene.delay * scene.period + scene.untold_delay, lag, (scene.camera or IDEAL_CAMERA).latency,
