@@ -80,6 +80,7 @@ class Gate:
         every: int = 1,
     ) -> None:  # fmt: skip
         self._reach = [(*rod.base, rod.length) for rod in robot.rods]
+        self._beyond = [(x, y, length * (1.0 + _TOO_LONG)) for x, y, length in self._reach]
         self._near = _SURPRISE * float(robot.lengths.min()) + _DEVIATIONS * tip_noise
         self._turn = limits.rate * dt * (1 + 1e-9) + angle_step
         self._lower = (limits.angle_lower - angle_step).tolist()
@@ -122,10 +123,10 @@ class Gate:
         told, due = x.tolist(), expected.tolist()  # on a few floats Python is faster than NumPy
         if self._wrapped:
             told[4:] = map(_unwrapped, told[4:], due[4:])
-        p, q = told[:2], told[4:]
-        angles_why, tip_why = self._odd_angles(q, due[4:]), self._odd_tip(told, due, with_velocity)
+        p, q, at = told[:2], told[4:], due[4:]
+        angles_why, tip_why = self._odd_angles(q, at), self._odd_tip(told, due, with_velocity)
         if angles_why is None:
-            self._encoders.believed(max(map(abs, map(sub, q, due[4:]))))
+            self._encoders.believed(max(map(abs, map(sub, q, at))))
             found.q = q
         else:
             text, unit = angles_why
@@ -157,20 +158,24 @@ class Gate:
             else:
                 found.note("measurement", k, f"{text}; bridged by the prediction")
         self._first = False
-        self._before = due[4:] if found.q is None else q
+        self._before = at if found.q is None else q
         return found
 
     def _odd_tip(self, x: list[float], expected: list[float], with_velocity: bool) -> tuple[str, bool] | None:
         """Why a tip is not to be believed, and whether other units explain it."""
-        px, py, vx, vy, *_ = x
-        ex, ey, evx, evy, *_ = expected
+        px, py, vx, vy = x[:4]
+        ex, ey, evx, evy = expected[:4]
         near = self._near + _TIP_ECHO * self._tip.surprise
         away = math.hypot(px - ex, py - ey)
         # So written that NaN is odd.
-        if away <= near and not self._too_far(px, py, _TOO_LONG):
-            if not with_velocity or self._dt * math.hypot(vx - evx, vy - evy) <= near:
-                return None
-            return f"tip velocity ({vx:.6g}, {vy:.6g}) m/s, expected ({evx:.6g}, {evy:.6g}) m/s", False
+        if away <= near:
+            for base_x, base_y, length in self._beyond:
+                if not math.hypot(px - base_x, py - base_y) < length:
+                    break
+            else:
+                if not with_velocity or self._dt * math.hypot(vx - evx, vy - evy) <= near:
+                    return None
+                return f"tip velocity ({vx:.6g}, {vy:.6g}) m/s, expected ({evx:.6g}, {evy:.6g}) m/s", False
         text = f"tip ({px:.6g}, {py:.6g}) m"
         if not math.isfinite(away):
             return f"{text} is not finite", False
@@ -194,13 +199,13 @@ class Gate:
     def _odd_angles(self, q: list[float], expected: list[float]) -> tuple[str, bool] | None:
         """Why motor angles are not to be believed, and whether other units explain them."""
         turn = self._turn + _ANGLE_ECHO * self._encoders.surprise
-        jumps = list(map(sub, q, self._before))
         # So written that NaN is odd.
-        for jump in jumps:
-            if not -turn <= jump <= turn:
+        for now, before in zip(q, self._before, strict=True):
+            if not -turn <= now - before <= turn:
                 break
         else:
             return None
+        jumps = list(map(sub, q, self._before))
         text = f"motor angles {_listed(q)} rad"
         if not all(map(math.isfinite, q)):
             return f"{text} are not finite", False
@@ -228,11 +233,10 @@ class Sifted:
         What was not believed, and why: ``kind`` and ``message``.
     """
 
-    def __init__(self) -> None:
-        self.p: list[float] | None = None
-        self.velocity: list[float] | None = None
-        self.q: list[float] | None = None
-        self.events: tuple[Event, ...] = ()
+    p: list[float] | None = None
+    velocity: list[float] | None = None
+    q: list[float] | None = None
+    events: tuple[Event, ...] = ()
 
     def note(self, kind: str, k: int, message: str) -> None:
         """Add an event of period k."""
