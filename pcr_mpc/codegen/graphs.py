@@ -56,13 +56,13 @@ def make_graphs(model: StepModel, target: StepModel, places: Places, law: Linear
     law : LinearMPC
     plant : Plant
     """
-    n = model.kind.n_rods
+    n, commanded = model.kind.n_rods, law.tuning.model.angles == "commanded"
     assert plant.step_model is not None
     condense = law.condensing(n, places.models, inline=False)
     steps = [step_graph(plant.step_model, count, details=False, inline=False) for count in (1, 2)]
     functions = {
-        "foresight": _called(foresight_graph(model, target, places, condense, inline=False), "look_ahead"),
-        "check": _called(checking(places.horizon, n, places.models), "look_back"),
+        "foresight": _called(foresight_graph(model, target, places, condense, commanded=commanded), "look_ahead"),
+        "check": _called(checking(places.horizon, n, places.models, inline=False), "look_back"),
         "follow": _rods(model, 2, "follow"),
         "finish": _rods(model, 1, "finish"),
         "target_follow": _rods(target, 2, "target_follow"),
@@ -72,7 +72,7 @@ def make_graphs(model: StepModel, target: StepModel, places: Places, law: Linear
         "determinant": _called(elastica.tip_determinant(), "determinant"),
         "curvature": _called(elastica.rod_curvature(inline=False), "curvature"),
     }
-    generator = ca.CodeGenerator("pcr_graphs.c")
+    generator = ca.CodeGenerator("pcr_graphs.c", {"casadi_int": "int"})
     for function in functions.values():
         generator.add(function)
     ends = [_entry(name, function.name()) for name, function in functions.items()]
@@ -80,7 +80,7 @@ def make_graphs(model: StepModel, target: StepModel, places: Places, law: Linear
 
 
 def _entry(name: str, function: str) -> str:
-    arguments = "const double **arg, double **res, long long *iw, double *w"
+    arguments = "const double **arg, double **res, int *iw, double *w"
     return f"int pcr_graph_{name}({arguments}) {{ return {function}(arg, res, iw, w, 0); }}\n"
 
 

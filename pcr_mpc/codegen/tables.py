@@ -10,6 +10,7 @@ import numpy as np
 
 from ..control.limited_qp import PENALTY
 from ..control.qp import stage_weights
+from ..errors import GenerationError
 from ..linearisation.model_graph import sizes
 from ..loop.parts.assembled import tip_noise
 from ..plant.motion.step_graph import limits as step_limits
@@ -180,7 +181,7 @@ def tables(subject: Subject) -> str:
         array("double", "pcr_plant_limits", np.array(step_limits(plant.step_model))),
         array("int", "pcr_in_places", np.array([0, *np.cumsum(_inputs(foresight)[1])[:-1]])),
         array("int", "pcr_out_places", np.array([0, *np.cumsum(_outputs(foresight)[1])[:-1]])),
-        array("double", "pcr_scene_reference", reference),
+        array("double", "pcr_scene_reference", _without_rates(subject, reference)),
         array("double", "pcr_scene_end", end),
         array("double", "pcr_scene_payloads", payloads),
         array("double", "pcr_critical_rows", rows),
@@ -191,6 +192,17 @@ def tables(subject: Subject) -> str:
         *_shapes(subject),
     ]  # fmt: skip
     return "\n".join(texts)
+
+
+def _without_rates(subject: Subject, reference: np.ndarray) -> np.ndarray:
+    """Rows of the reference without the rates, which C finds as the differences of the angles, from the start on."""
+    n, period = subject.robot.n_rods, subject.scene.period
+    start = np.concatenate([subject.controller.reference.states[0], [0.0, 0.0]])
+    rows = np.vstack([start, np.delete(reference, slice(4 + n, 4 + 2 * n), axis=1)])
+    if not np.array_equal(np.diff(rows[:, 4:-2], axis=0) / period, reference[:, 4 + n : 4 + 2 * n]):
+        raise GenerationError(f"{subject.scene.name}: the reference's rates are not the differences of its angles, "
+                              "which C takes them for", part="reference")  # fmt: skip
+    return rows
 
 
 def _shapes(subject: Subject) -> list[str]:

@@ -129,8 +129,8 @@ def condensing(
 
 
 @graph_cache(maxsize=32)
-def checking(horizon: int, n: int, models: int) -> Any:
-    """Graph of what a solution of the QP leads to, and of how good it is.
+def checking(horizon: int, n: int, models: int, *, inline: bool = True) -> Any:
+    """Graph of what a solution of the QP leads to, and of how good it is; ``inline`` as of `condensing`.
 
     Returns
     -------
@@ -166,4 +166,4 @@ def checking(horizon: int, n: int, models: int) -> Any:
     numbers = primal, dual, excess, ca.norm_inf(of_rates), ca.norm_inf(of_changes), ca.mmin(kept)
     arguments = [packed, x, upper_triangle, q, lower, upper, bounds, dt, clear, inputs, y]
     graph = ca.Function("check", arguments, [ca.horzcat(*states), ca.vertcat(*numbers)])
-    return graph.expand("check", {"cse": True}) if horizon <= _UNROLLED else graph
+    return graph.expand("check", {"cse": True}) if inline and horizon <= _UNROLLED else graph

@@ -130,7 +130,7 @@ typedef struct {
     double w[PCR_W];
     const double *arg[PCR_ARG];
     double *res[PCR_RES];
-    long long iw[PCR_IW];
+    int iw[PCR_IW];
     pcr_sensor tip, encoders;
     int first;
     double before[PCR_N];                                   /* angles that were believed last */
@@ -154,7 +154,7 @@ typedef struct {
     double w[PCR_PLANT_W];
     const double *arg[PCR_PLANT_ARG];
     double *res[PCR_PLANT_RES];
-    long long iw[PCR_PLANT_IW];
+    int iw[PCR_PLANT_IW];
 } pcr_plant;
 
 /* Get ready in a pose; NULL: where the scene starts. */

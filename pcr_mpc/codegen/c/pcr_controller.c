@@ -172,6 +172,17 @@ pcr_result pcr_controller_set_parameters(pcr_controller *c, const pcr_parameters
     return PCR_OK;
 }
 
+/* A row of the window: state at the end of a period, rates in it, and the force that the rods carry at its end. */
+static void write_row(double *to, int row)
+{
+    const double *before = pcr_scene_reference[row], *at = pcr_scene_reference[row + 1];
+    memcpy(to, at, PCR_STATES * sizeof *to);
+    for (int i = 0; i < PCR_N; i++) {
+        to[PCR_STATES + i] = (at[4 + i] - before[4 + i]) / PCR_PERIOD;
+    }
+    memcpy(to + PCR_STATES + PCR_N, at + PCR_STATES, 2 * sizeof *to);
+}
+
 /* Write what is known in this period besides the measurement. */
 static void tell(pcr_controller *c, const pcr_measurement *measured)
 {
@@ -184,9 +195,11 @@ static void tell(pcr_controller *c, const pcr_measurement *measured)
         memcpy(window, measured->window, PCR_HORIZON * PCR_ROW * sizeof *window);
     } else {
         for (int k = 0; k < PCR_HORIZON; k++) {
-            const int row = c->period + PCR_DELAY + k;
-            memcpy(window + k * PCR_ROW, c->period < PCR_PERIODS ? pcr_scene_reference[row] : pcr_scene_end,
-                   PCR_ROW * sizeof *window);
+            if (c->period < PCR_PERIODS) {
+                write_row(window + k * PCR_ROW, c->period + PCR_DELAY + k);
+            } else {
+                memcpy(window + k * PCR_ROW, pcr_scene_end, PCR_ROW * sizeof *window);
+            }
         }
     }
     if (measured->payloads != NULL) {

@@ -6,16 +6,16 @@
 extern "C" {
 #endif
 
-int pcr_graph_foresight(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_check(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_follow(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_finish(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_target_follow(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_target_finish(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_plant_once(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_plant_twice(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_determinant(const double **arg, double **res, long long *iw, double *w);
-int pcr_graph_curvature(const double **arg, double **res, long long *iw, double *w);
+int pcr_graph_foresight(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_check(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_follow(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_finish(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_target_follow(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_target_finish(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_plant_once(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_plant_twice(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_determinant(const double **arg, double **res, int *iw, double *w);
+int pcr_graph_curvature(const double **arg, double **res, int *iw, double *w);
 
 #ifdef __cplusplus
 }

@@ -32,11 +32,11 @@ pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measur
 
 /* pcr_rods.c: follow the rods from `record` to another pose. `twice` and `once` are graphs that take two Newton
    iterations or one. Returns 0 if they followed: `record` and `result` are then of that pose. */
-typedef int pcr_graph(const double **arg, double **res, long long *iw, double *w);
+typedef int pcr_graph(const double **arg, double **res, int *iw, double *w);
 typedef struct {
     const double **arg;
     double **res;
-    long long *iw;
+    int *iw;
     double *w;
 } pcr_room;
 int pcr_climb(pcr_graph *first, pcr_graph *once, const double *numbers, const double *p, const double *q,

@@ -18,7 +18,8 @@ extern const double pcr_scene_memory[PCR_PLANT_MEMORY];   /* of the plant there 
 extern const double pcr_plant_limits[5];                  /* of a verdict with which the rods have followed */
 extern const int pcr_in_places[PCR_INS], pcr_out_places[PCR_OUTS]; /* where inputs and outputs of the graph lie */
 extern const double pcr_scene_plant_numbers[PCR_NUMBERS];
-extern const double pcr_scene_reference[PCR_REFERENCE_ROWS][PCR_ROW];
+/* State at the start, and at the ends of all periods, and the force that the rods carry there. */
+extern const double pcr_scene_reference[PCR_REFERENCE_ROWS + 1][PCR_STATES + 2];
 extern const double pcr_scene_end[PCR_ROW];               /* held beyond the end of the reference */
 extern const double pcr_scene_payloads[PCR_PAYLOAD_ROWS];
 extern const double pcr_critical_rows[PCR_CRITICAL], pcr_critical_loads[PCR_CRITICAL];

@@ -112,7 +112,10 @@ def make_foresight(tuning: Tuning, law: Law, robot: Robot, delay: int, period: f
     condense = law.condensing(robot.n_rods, models) if isinstance(law, LinearMPC) else None
     model = make_model(robot, tuning.model)
     target = Plant(robot, compiled=tuning.model.compiled)
-    return Foresight(model, target, places, period, condense, compiled=tuning.model.compiled)
+    return Foresight(
+        model, target, places, period, condense, commanded=tuning.model.angles == "commanded",
+        compiled=tuning.model.compiled,
+    )  # fmt: skip
 
 
 def graph_of(tuning: Tuning) -> tuple[object, ...]:

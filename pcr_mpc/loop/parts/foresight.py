@@ -80,6 +80,8 @@ class Foresight:
         [s].
     condense : casadi.Function or None
         See `condensing`.
+    commanded : bool
+        See `foresight_graph`.
     compiled : bool
         Whether to run as machine code where there is a compiler.
 
@@ -111,13 +113,16 @@ class Foresight:
         period: float,
         condense: Any | None,
         *,
+        commanded: bool = True,
         compiled: bool = False,
     ) -> None:
         assert plant.step_model is not None
         assert target.step_model is not None
         self._plant, self._target_plant, self.places, self._period = plant, target, places, period
         inline = not (compiled and has_compiler())
-        function = foresight_graph(plant.step_model, target.step_model, places, condense, inline=inline)
+        function = foresight_graph(
+            plant.step_model, target.step_model, places, condense, commanded=commanded, inline=inline
+        )
         self._graph = graph = BufferedFunction(fastest(function, compiled))
         n, ends = plant.robot.n_rods, np.cumsum([view.size for view in graph.outputs]).tolist()
         self.inputs = given = dict(zip(function.name_in(), graph.inputs, strict=True))

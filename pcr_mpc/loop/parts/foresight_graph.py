@@ -56,7 +56,13 @@ class Places:
 
 @graph_cache(maxsize=16)
 def foresight_graph(
-    model: StepModel, target: StepModel, places: Places, condense: Any | None, *, inline: bool = False
+    model: StepModel,
+    target: StepModel,
+    places: Places,
+    condense: Any | None,
+    *,
+    commanded: bool = True,
+    inline: bool = False,
 ) -> Any:
     """Build the graph.
 
@@ -67,6 +73,9 @@ def foresight_graph(
     places : Places
     condense : casadi.Function or None
         See `condensing`. None: no QP is wanted.
+    commanded : bool
+        Angles that are planned from may differ from the measured ones; else ``pull`` is 1, and the graph leaves out
+        what comes to nothing then.
     inline : bool
         Make one list of instructions of each model, for CasADi's interpreter; else calls, for a compiler.
 
@@ -111,7 +120,7 @@ def foresight_graph(
     }
     given = SimpleNamespace(**inputs)
     given.states, given.inputs, given.forces = ca.vertsplit(given.window, [0, 4 + n, 4 + 2 * n, 6 + 2 * n])
-    corrected = _corrected(given, n)
+    corrected = _corrected(given, n, commanded=commanded)
     x, force = corrected[:-2], corrected[-2:]
     graph_of = model_list if inline else model_graph
     found = [_place(graph_of, model, given, x, force, 0, last=count == 1)]
@@ -120,9 +129,9 @@ def foresight_graph(
         ahead = _moved(found[j][1], ahead, given.on_the_way[:, j], n)
         arriving = ahead if j == 0 else arriving
         found.append(_place(graph_of, model, given, ahead, force, j + 1, last=j + 1 == count - 1))
-    due, rates = _due(given, places.horizon)
+    due, rates = _due(given, places.horizon) if commanded else (ca.DM(n, places.horizon + 1), ca.DM(n, 1))
     for j in range(places.delay + 1, count):
-        there = given.path[:, j - places.delay - 1] - ca.vertcat(ca.DM.zeros(4), due[:, j - places.delay])
+        there = given.path[:, j - places.delay - 1] - ca.vertcat(ca.DM(4, 1), due[:, j - places.delay])
         found.append(_place(graph_of, model, given, there, force, j, last=j == count - 1))
     records, models, good, states_of = (ca.horzcat(*columns) for columns in zip(*found, strict=True))
     shift, target_record, target_good = _shifted(target, given, force, n)
@@ -130,14 +139,18 @@ def foresight_graph(
         ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon) + due[:, 1:]
     )  # fmt: skip
     reckoned, of_plan = given.reckoned + given.dt * given.u_previous, models[:, places.delay :]
-    # Angles that commands lead to and that are not measured are on their way, or slowly given up for lost.
-    had_followed = ahead[4:] + due[:, 0]
-    planned = had_followed + (1 - given.pull) * (reckoned + given.lead - had_followed)
-    lags = (1 - given.pull) * given.lags + ca.vertcat(ca.dot(rates, planned - ahead[4:]), ca.sumsqr(rates))
-    ahead = ca.vertcat(ahead[:4], planned)
     changes = (due[:, 1:] - due[:, :-1]) / given.dt
-    by_rate = ca.reshape(models[(4 + n) * (5 + n) : (4 + n) * (5 + 2 * n), 0], 4 + n, n)[:4, :]
-    of_plan = ca.horzcat(*(_behind(of_plan[:, j], due[:, j], changes[:, j], n) for j in range(places.models)))
+    lags, moves = ca.DM.zeros(2), ca.DM.zeros(4, n)
+    if commanded:
+        # Angles that commands lead to and that are not measured are on their way, or slowly given up for lost.
+        had_followed = ahead[4:] + due[:, 0]
+        planned = had_followed + (1 - given.pull) * (reckoned + given.lead - had_followed)
+        lags = (1 - given.pull) * given.lags + ca.vertcat(ca.dot(rates, planned - ahead[4:]), ca.sumsqr(rates))
+        lags = (given.pull < 1) * lags
+        ahead = ca.vertcat(ahead[:4], planned)
+        by_rate = ca.reshape(models[(4 + n) * (5 + n) : (4 + n) * (5 + 2 * n), 0], 4 + n, n)[:4, :]
+        moves = (given.pull < 1) * by_rate / given.dt
+        of_plan = ca.horzcat(*(_behind(of_plan[:, j], due[:, j], changes[:, j], n) for j in range(places.models)))
     qp: Any = [ca.MX(0, 1)] * 4
     measures = ca.MX.zeros(3)
     if condense is not None:
@@ -149,17 +162,18 @@ def foresight_graph(
         "carried": given.forces + force, "signs": _signs(model, given, records[:, places.delay]), "good": good,
         "decisions": ca.vertcat(ca.mmin(good), ca.norm_inf(reckoned - ahead[4:]), measures),
         "followed": records, "stays": records[:, -1], "followed_target": target_record, "moved_shift": shift,
-        "moved_reckoned": reckoned, "moved_lead": planned - reckoned,
-        "next_moves": (given.pull < 1) * by_rate / given.dt, "next_lags": (given.pull < 1) * lags,
+        "moved_reckoned": reckoned, "moved_lead": ahead[4:] - reckoned, "next_moves": moves, "next_lags": lags,
         "now": models[:, : places.delay], "models": of_plan, "ahead": ahead, "P": qp[0], "q": qp[1], "l": qp[2],
         "u": qp[3],
     }  # fmt: skip
     return ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
 
 
-def _corrected(given: Any, n: int) -> Any:
+def _corrected(given: Any, n: int, *, commanded: bool) -> Any:
     """State and force after the measurement; the tip has moved with the angles as they are measured to have turned."""
     estimate, measured = given.estimate, given.measured
+    if not commanded:  # the angles were foreseen
+        return correction(n)(estimate, measured, given.gain, given.half_step)
     p, q = estimate[:2], estimate[4:-2]
     turned = ca.fmin(ca.fmax(q, measured[2:] - given.half_step), measured[2:] + given.half_step) - q
     tip = estimate[:4] + given.moves @ turned
