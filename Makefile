@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: track test test-slow lint docs figures charts benchmarks mutants clean
+.PHONY: track test test-slow test-browser lint docs figures charts benchmarks mutants clean
 
 track: $(READY)  ## follow the figure of eight in closed loop; pictures and table in results/lemniscate
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml
@@ -13,6 +13,10 @@ test: $(READY)  ## the default test run
 
 test-slow: $(READY)  ## the tests marked slow, but for those of minutes: -m longest
 	$(BIN)/python -m pytest -q -m "slow and not longest" -n auto --dist loadfile
+
+test-browser: $(READY)  ## the page of `pcr-mpc view` in a headless browser; screenshots in results/browser
+	.ci/browser
+	$(BIN)/python -m pytest -q -s tests/browser
 
 lint: $(READY)  ## style, types, layers
 	$(BIN)/ruff check .

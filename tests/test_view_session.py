@@ -9,9 +9,9 @@ import pytest
 from pcr_mpc import Plant, load_scene
 from pcr_mpc.errors import PCRError
 from pcr_mpc.loop.run.run import load_run
-from pcr_mpc.plant.statics.free_tip import forward_statics
 from pcr_mpc.study.identification.log import read_log
 from pcr_mpc.view.session import Session
+from tests.view_check import spring_balance
 
 
 @pytest.fixture(scope="module")
@@ -36,22 +36,6 @@ def session(played):
 
 def kinds(session):
     return [event["kind"] for event in session.events]
-
-
-def spring_balance(robot, start, stiffness, end, steps=20):
-    """Where a free tip rests on a spring, by Newton's method on the statics alone: no motion, no plant."""
-    p = start.p.copy()
-    pose = start
-    for k in range(1, steps + 1):
-        goal = start.p + k / steps * (end - start.p)
-        for _ in range(20):
-            pose = forward_statics(robot, start.q, force=stiffness * (goal - p), guess=pose)
-            if np.abs(pose.p - p).max() < 1e-10:
-                break
-            # F(p) = k (goal - p): the free tip under that force is a map whose fixed point is looked for.
-            slope = np.linalg.inv(pose.dforce_dp)
-            p = p + np.linalg.solve(np.eye(2) + stiffness * slope, pose.p - p)
-    return p
 
 
 def test_a_tip_that_is_dragged_rests_where_the_statics_say(session):

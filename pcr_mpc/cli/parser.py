@@ -27,6 +27,7 @@ examples:
   pcr-mpc generate lemniscate --out build/lemniscate       controller and plant as C
   pcr-mpc hil lemniscate                                in real time, the controller over a wire
   pcr-mpc view lemniscate                               the robot live in a browser: pull at it
+  pcr-mpc replay results/lemniscate                     a recorded run as one page
   pcr-mpc timing lemniscate                             step times against the real-time budgets
   pcr-mpc tune pick_and_place --trials 20 --jobs 2 --out better.toml   a better controller
   pcr-mpc margins lemniscate                            how much delay, lag and mismatch the loop bears
@@ -97,7 +98,9 @@ def parser() -> argparse.ArgumentParser:
     track.add_argument("--links", type=int, help="of each rod, with --plant mujoco (default 40)")
     track.add_argument("--seed", type=int, default=0, help="of the measurement noise (default 0)")
     track.add_argument("--out", type=Path, help="folder for the results (default results/NAME)")
-    track.add_argument("--no-pictures", action="store_true", help="write the record only")
+    track.add_argument(
+        "--no-pictures", action="store_true", help="write the record only, neither pictures nor replay.html"
+    )
 
     statics = command(
         "statics",
@@ -254,6 +257,14 @@ def parser() -> argparse.ArgumentParser:
                       "the page's address there moves the robot")  # fmt: skip
     look.add_argument("--seed", type=int, default=0, help="of the measurement noise (default 0)")
     look.add_argument("--out", type=Path, metavar="DIR", help="folder for recordings (default results/view/NAME)")
+    again = command(
+        "replay",
+        "view",
+        "replay",
+        "Put a recorded run into one page that plays it in any browser, without a server or a network.",
+    )
+    again.add_argument("record", type=Path, metavar="RUN", help="folder of a run, as track and view write it")
+    again.add_argument("--out", type=Path, metavar="FILE", help="page to write (default replay.html beside the run)")
     for served in (server, loop):
         served.add_argument("--generated", action="store_true", help="the controller as generated C, which is compiled "
                             "first, instead of Python's")  # fmt: skip

@@ -30,10 +30,11 @@ from ..report.laps import plot_laps
 from ..report.plots import animate_run, plot_run
 from ..report.tables import summary_table
 from ..study.margins.predicted import predict_delay_margin
+from ..view.replay import write_replay
 from .parser import LINKS
 
 _MARGIN_POSES = 5  # a quarter of a second
-_PICTURES, _LEARNT = ("track.png", "track.gif"), ("laps.png",)
+_PICTURES, _LEARNT = ("track.png", "track.gif", "replay.html"), ("laps.png",)
 
 
 def track(options: argparse.Namespace) -> int:
@@ -114,7 +115,8 @@ def _drawn(run: Run, folder: Path) -> bool:
     try:
         plot_run(run, paths[0])
         animate_run(run, paths[1], progress=True)
-        for path in paths[2:]:
+        write_replay(run, paths[2])
+        for path in paths[3:]:
             plot_laps(run, path)
     except (PCRError, ValueError) as error:
         for path in paths:

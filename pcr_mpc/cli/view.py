@@ -1,4 +1,4 @@
-"""The command of the command line that shows a scene in a browser."""
+"""The commands of the command line that show a robot in a browser."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ import webbrowser
 from pathlib import Path
 
 from ..control.tuning import Tuning, load_tuning
+from ..files import require_free
 from ..loop.controller.own_controller import OwnController
+from ..loop.run.run import load_run
 from ..loop.scene.file import load_scene
+from ..view.replay import write_replay
 from ..view.server import ViewServer
 from ..view.session import Session
 
@@ -41,4 +44,16 @@ def view(options: argparse.Namespace) -> int:
         print(f"{scene.name}: ended", file=sys.stderr)
     if options.json:
         print(json.dumps({"scene": scene.name, **server.counts}))
+    return 0
+
+
+def replay(options: argparse.Namespace) -> int:
+    """Run `pcr-mpc replay`."""
+    folder = options.record if options.record.is_dir() else options.record.parent
+    out = options.out or folder / "replay.html"
+    require_free(out, force=options.overwrite)
+    run = load_run(folder)
+    write_replay(run, out)
+    said = {"scene": run.scene.name, "duration_s": float(run.t[-1]), "run_hash": run.hash(), "file": str(out)}
+    print(json.dumps(said) if options.json else f"{run.scene.name}: {run.t[-1]:g} s in {out}; open it in any browser")
     return 0

@@ -115,5 +115,5 @@ def about(session: Session) -> dict[str, Any]:
     return about_robot(scene.robot) | {
         "scene": scene.name, "live": True, "path": path_of(scene), "period": session.period, "dials": dials,
         "controllers": session.choice.names, "modes": modes, "limits": limits_of(scene),
-        "speeds": [SLOWEST, FASTEST], "spring": round(session.rig.stiffness, 2),
+        "speeds": [SLOWEST, FASTEST], "spring": round(session.rig.stiffness, 6),
     }  # fmt: skip

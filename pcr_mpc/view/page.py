@@ -9,7 +9,7 @@ from typing import Any
 
 _FOLDER = Path(__file__).parent / "page"
 _STYLES = ("style.css",)
-_SCRIPTS = ("link.js", "canvas.js", "strips.js", "panel.js", "hands.js", "main.js")
+_SCRIPTS = ("link.js", "layers.js", "canvas.js", "strips.js", "panel.js", "hands.js", "main.js")
 
 
 def page(data: dict[str, Any] | None = None) -> str:

@@ -8,16 +8,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..errors import PCRError
 from ..loop.hardware.camera import IDEAL, Pictures
 from ..loop.run.drive import drive_of
 from ..loop.run.untold_delay import UntoldDelay
 from ..loop.scene.scene import Scene
 from ..plant.motion.plant import Plant
 from ..plant.statics.equilibrium import Equilibrium
+from ..plant.statics.free_tip import inverse_statics
 from ..plant.statics.solver import Snap
 
 _STRONGEST = 50.0  # force of the spring at most, in sum EI/L^2
 _DAMPING = 0.4  # of the tip on the spring
+_NEARER = (1.0, 0.8, 0.6, 0.45)  # shares of the way from the motors to the start, where a mode is looked for
 _HAND = 0.04  # s, time constant with which a motor follows the hand that turns it
 
 
@@ -160,3 +163,16 @@ class Rig:
     def equilibrium(self) -> Equilibrium:
         """Everything about the rods as they are."""
         return self.plant.equilibrium(self.x)
+
+
+def pose_of_mode(scene: Scene, mode: str) -> Equilibrium:
+    """The pose of a working mode at the scene's start, or nearer to the motors."""
+    start, middle = scene.start().p, scene.robot.bases.mean(axis=0)
+    failure: PCRError | None = None
+    for share in _NEARER:
+        try:
+            return inverse_statics(scene.robot, middle + share * (start - middle), mode=mode)
+        except PCRError as error:
+            failure = failure or error
+    assert failure is not None
+    raise failure

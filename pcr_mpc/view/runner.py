@@ -48,7 +48,7 @@ class Runner(threading.Thread):
         self._asked: deque[tuple[Any, Message]] = deque()
         self._turn = threading.Condition()
         self._over = False
-        self._heard = 0
+        self._heard, self._felt = 0, 0.0  # number of the last command, and when the plant first moved after it
         self._ratio = 1.0
         self._frames = 0
 
@@ -103,6 +103,8 @@ class Runner(threading.Thread):
                 piece = min(owed, max(session.period, session.rig.dt))
                 done = session.advance(piece) * session.rig.dt
                 owed, passed = owed - done, passed + done
+                if done and not self._felt:
+                    self._felt = time.time()
             last = now
             if now - second >= 1.0:
                 self._ratio, second, passed = passed / (now - second), now, 0.0
@@ -121,7 +123,8 @@ class Runner(threading.Thread):
                 if not self._asked:
                     return
                 sender, message = self._asked.popleft()
-            self._heard = message.get("id", self._heard)
+            if "id" in message:
+                self._heard, self._felt = message["id"], 0.0
             try:
                 apply(session, message)
             except (PCRError, ValueError) as error:
@@ -136,6 +139,7 @@ class Runner(threading.Thread):
             return
         self._frames += 1
         found = frame(session, eq) | {"kind": "frame", "n": self._frames, "heard": self._heard}
+        found["felt"] = round(1e3 * self._felt, 2) or None
         found["ratio"] = round(self._ratio, 3) if math.isfinite(self._ratio) else None
         self._publish("frame", (self._frames, json.dumps(found, separators=(",", ":")), eq.q))
 

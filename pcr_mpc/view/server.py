@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
 import secrets
 import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from http import HTTPStatus
-from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
@@ -21,7 +18,7 @@ from .. import interrupt
 from ..errors import OutputError, PCRError
 from ..plant.robot import Robot
 from .commands import LONGEST, MessageError, read
-from .page import page
+from .door import answer, is_loopback, is_socket, refusal
 from .pages import Page, text_of
 from .runner import Runner
 from .scenery import Scenery
@@ -34,7 +31,6 @@ if TYPE_CHECKING:
 _LISTEN = 0.05  # s, between looks at whether to end
 _PAGES = 16  # at once
 _GHOSTS = 0.1  # s between two looks for ghosts
-_LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
 class ViewServer:
@@ -70,7 +66,7 @@ class ViewServer:
         except ImportError as error:
             raise PCRError("the view needs websockets: pip install 'pcr_mpc[view]'") from error
         host = address[0]
-        local = host == "localhost" or _loopback(host)
+        local = is_loopback(host)
         if not (local or anywhere):
             raise OutputError(f"{host} is no loopback address: whoever can see the page's address there moves the "
                               "robot; if that is meant, say --anywhere", path=host)  # fmt: skip
@@ -218,35 +214,15 @@ class ViewServer:
 
     def _requested(self, connection: ServerConnection, request: Request) -> Response | None:
         """Hand out the page, let its socket in, and nobody else."""
-        address = urlsplit(request.path)
-        given = parse_qs(address.query).get("token", [""])[0]
-        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-        host = hosts[0] if len(hosts) == 1 else ""
-        refused = ""
-        if self._local and host.rpartition(":")[0] not in _LOOPBACK:
-            refused = "not under that name"
-        elif not hmac.compare_digest(given.encode(), self.token.encode()):
-            refused = "the address lacks the token that the command printed"
-        elif origins and origins != [f"http://{host}"]:
-            refused = "not from that origin"
+        refused = refusal(request, self.token, local=self._local)
+        if not refused and is_socket(request):
+            if len(self._pages) < _PAGES:
+                return None
+            refused = f"{_PAGES} pages look on already"
         if refused:
             self.counts["refused"] += 1
             return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
-        if address.path == "/socket":
-            if len(self._pages) >= _PAGES:
-                self.counts["refused"] += 1
-                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{_PAGES} pages look on already\n")
-            return None
-        if address.path != "/":
-            return connection.respond(HTTPStatus.NOT_FOUND, "there is one page, at /\n")
-        answer = connection.respond(HTTPStatus.OK, page())
-        del answer.headers["Content-Type"]
-        answer.headers["Content-Type"] = "text/html; charset=utf-8"
-        answer.headers["Cache-Control"] = "no-store"
-        answer.headers["Referrer-Policy"] = "no-referrer"
-        answer.headers["X-Content-Type-Options"] = "nosniff"
-        answer.headers["X-Frame-Options"] = "DENY"
-        return answer
+        return answer(connection, request)
 
     async def _connected(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
@@ -309,13 +285,6 @@ class ViewServer:
         for each in self._pages:
             free = self._steering is None
             each.tell(text_of("role", steers=self._steering is each, free=free, pages=len(self._pages)))
-
-
-def _loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _quiet() -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -15,21 +14,19 @@ from ..loop.controller.own_controller import OwnController
 from ..loop.parts.controllers import Decision
 from ..loop.scene.scene import Scene
 from ..plant.statics.equilibrium import Equilibrium
-from ..plant.statics.free_tip import inverse_statics
+from .journal import Journal
 from .pilot import OFF, Choice, Pilot
 from .recorder import Recorder
-from .rig import Rig
+from .rig import Rig, pose_of_mode
 from .settings import Settings, dials_of, settings_of
 
 _KEPT_EVERY = 0.1  # s, between poses to which the robot can go back
 _BACK = 3  # of them
 _LOST_AGAIN = 0.5  # s
 SLOWEST, FASTEST = 0.02, 4.0
-_EVENTS = 30
-_NEARER = (1.0, 0.8, 0.6, 0.45)  # shares of the way from the motors to the start, where a mode is looked for
 
 
-class Session:
+class Session(Journal):
     """One robot, one controller, one clock. Nothing here knows of a network or of real time.
 
     Parameters
@@ -52,27 +49,20 @@ class Session:
         Of its time over real time that is asked for.
     decision : Decision or None
         The last.
-    events : deque of dict
-        The last ones: number, time, kind, message, and for a snap rod, place and energy.
     mode, mode_now : str
         Working mode of the start, and that which the rods were last seen in.
     chosen : str
         Name of the controller.
-    recorder, finished : Recorder or None
-        What records now, and the last that was ended.
     """
 
     def __init__(self, scene: Scene, own: Tuning | OwnController | None = None, seed: int = 0) -> None:
+        super().__init__()
         self._told, self._seed = scene, checked_integer("seed", seed, minimum=0)
         self.choice, self.dials = Choice(scene, own), dials_of(scene)
         self.settings = settings_of(scene)
         self.start_pose = scene.start()
         self.mode = self.start_pose.mode
         self.paused, self.speed = False, 1.0
-        self.events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
-        self._told_events = 0
-        self.recorder: Recorder | None = None
-        self.finished: Recorder | None = None
         self.chosen = self.choice.first
         self.pilot = Pilot(scene, self.choice[self.chosen])
         self._begin()
@@ -97,15 +87,6 @@ class Session:
     def period(self) -> float:
         """Control period [s]."""
         return self.pilot.scene.period
-
-    def tell(self, kind: str, message: str, **more: Any) -> None:
-        """Note an event."""
-        self._told_events += 1
-        self.events.append({"n": self._told_events, "t": round(self.t, 4), "kind": kind, "message": message, **more})
-        if self.recorder is not None:
-            self.recorder.tell(self.t, kind, message)
-
-    # Time
 
     def advance(self, duration: float) -> int:
         """Run for a time [s], in whole steps of the plant; return how many. What is left over is lost."""
@@ -188,8 +169,6 @@ class Session:
         self.tell("recovered", f"the robot was put {where}")
         self._take_up(back, follow=False)
 
-    # The controller and its target
-
     def _take_up(self, pose: Equilibrium, *, follow: bool) -> None:
         """Let the controller begin where the robot is."""
         self._j, self._decided = 0, self.t
@@ -251,8 +230,6 @@ class Session:
         """Let the target brake, and stay."""
         self.pilot.stop()
 
-    # Hands
-
     def drag(self, x: float, y: float) -> None:
         """Pull the tip by a spring whose other end is at a point [m]."""
         self.rig.pull = checked_vector("pull", (x, y), 2)
@@ -272,8 +249,6 @@ class Session:
         if self.rig.hand is not None:
             self.rig.hand = None
             self._take_up(self.rig.equilibrium(), follow=False)
-
-    # What surrounds it
 
     def pause(self, on: bool) -> None:
         """Let time stand, or go on."""
@@ -297,7 +272,7 @@ class Session:
         PCRError, ValueError
             There is no such pose; the robot stays as it is.
         """
-        self.start_pose = _pose_of_mode(self._told, mode)
+        self.start_pose = pose_of_mode(self._told, mode)
         self.mode = mode
         self.reset()
 
@@ -315,26 +290,9 @@ class Session:
 
     def record(self, on: bool) -> None:
         """Begin to record, or end it: then the record is ``finished``."""
-        if on and self.recorder is None:
+        if not on:
+            self.end_record(self.pilot, self.rig)
+        elif self.recorder is None:
             while self._j:
                 self._step()
             self.recorder = Recorder(self.scene, self.rig, self.target(), self._seed)
-        elif not on and self.recorder is not None:
-            recorder, self.recorder = self.recorder, None
-            try:
-                self.finished = recorder.ended(self.pilot, self.rig)
-            except PCRError as error:
-                self.tell("refused", str(error))
-
-
-def _pose_of_mode(scene: Scene, mode: str) -> Equilibrium:
-    """The pose of a working mode at the scene's start, or nearer to the motors."""
-    start, middle = scene.start().p, scene.robot.bases.mean(axis=0)
-    failure: PCRError | None = None
-    for share in _NEARER:
-        try:
-            return inverse_statics(scene.robot, middle + share * (start - middle), mode=mode)
-        except PCRError as error:
-            failure = failure or error
-    assert failure is not None
-    raise failure

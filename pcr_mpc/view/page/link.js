@@ -7,7 +7,8 @@ class Live {
     this.on = on;
     this.id = 0;
     this.sentAt = new Map();
-    this.delays = [];  // ms from a command to the first frame whose plant has felt it
+    this.delays = [];  // ms from a command until the plant has moved under it; on one computer clocks agree
+    this.shown = [];  // ms until a frame shows it
     this.open();
   }
 
@@ -17,7 +18,7 @@ class Live {
     this.socket = new WebSocket(`${scheme}://${location.host}/socket?token=${encodeURIComponent(query.get("token") || "")}`);
     this.socket.onmessage = (event) => {
       const message = JSON.parse(event.data);
-      if (message.kind === "frame") this.felt(message.heard);
+      if (message.kind === "frame") this.felt(message);
       this.on(message);
     };
     this.socket.onclose = () => {
@@ -26,13 +27,16 @@ class Live {
     };
   }
 
-  felt(heard) {
+  felt(frame) {
     for (const [id, at] of this.sentAt) {
-      if (id > heard) break;
-      this.delays.push(performance.now() - at);
+      if (id > frame.heard || (id === frame.heard && !frame.felt)) break;
+      if (id === frame.heard) {
+        this.delays.push(frame.felt - performance.timeOrigin - at);
+        this.shown.push(performance.now() - at);
+      }
       this.sentAt.delete(id);
     }
-    if (this.delays.length > 1000) this.delays.splice(0, 500);
+    for (const list of [this.delays, this.shown]) if (list.length > 1000) list.splice(0, 500);
   }
 
   send(message) {
@@ -53,6 +57,7 @@ class Live {
 class Recording {
   constructor(data, on) {
     this.frames = data.frames;
+    this.events = data.events;
     this.on = on;
     this.at = 0;
     this.time = this.frames[0].t;
@@ -60,7 +65,6 @@ class Recording {
     this.last = null;
     setTimeout(() => {
       on({ kind: "about", ...data.about });
-      if (data.workspace) on({ kind: "workspace", ...data.workspace });
       requestAnimationFrame((now) => this.turn(now));
     });
   }
@@ -81,10 +85,12 @@ class Recording {
 
   show(i) {
     if (i === this.at && this.shown) return;
+    if (i < this.at) this.on({ kind: "again" });
     this.at = i;
     this.shown = true;
     const frame = this.frames[i];
-    this.on({ kind: "frame", n: i, paused: this.paused, ...frame });
+    const events = this.events.filter((event) => event.t <= frame.t + 1e-6);
+    this.on({ kind: "frame", n: i, paused: this.paused, events, ...frame });
   }
 
   send(message) {

@@ -62,6 +62,7 @@
       if (message.problem) panel.banner(message.problem);
       canvas.ghosts = message.ghosts || null;
     },
+    again() { panel.forget(); },
     lost() { panel.banner("The server does not answer; trying again…", 0); lost = true; },
   };
   let lost = false;
@@ -92,9 +93,10 @@
     }
     const fresh = frame;
     for (const event of panel.takeEvents(fresh.events || [])) {
-      if (event.kind === "snap") canvas.flash(event, now / 1000);
+      if (event.kind === "snap" && event.p) canvas.flash(event, now / 1000);
       if (["refused", "failure", "recovered"].includes(event.kind)) panel.banner(event.message);
     }
+    if (canvas.workspace && fresh.start && canvas.workspace.mode !== fresh.start) { canvas.setWorkspace({}); drawLegend(); }
     canvas.take(fresh, now / 1000);
     const error = fresh.target ? 1000 * Math.hypot(fresh.p[0] - fresh.target[0], fresh.p[1] - fresh.target[1]) : null;
     strips[0].take(fresh.t, fresh.u);

@@ -154,6 +154,11 @@ class Panel {
     return fresh;
   }
 
+  forget() {
+    this.known = 0;
+    $("events").replaceChildren();
+  }
+
   banner(text, seconds = 5) {
     $("banner").textContent = text;
     $("banner").hidden = !text;
