@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import ModelError, load_scene, load_tuning, make_controller, simulate
+from pcr_mpc.loop.demand.feed_forward import feed_forward
 
 from .conftest import CONTROLLERS, MODELS
 
@@ -91,3 +92,20 @@ def test_heavy_rods_are_driven_better_by_a_model_that_knows_their_inertia():
         assert summary["fallbacks"] == summary["limit_violations"] == 0
     assert errors["condensed"] < 0.02
     assert errors["condensed"] < 0.3 * errors["none"]
+
+
+def test_heavy_rods_are_driven_fast():
+    """The motors' rates alone lead a robot with such rods along a reference that a fixed point does not settle on."""
+    scene = load_scene(MODELS / "scenes" / "lemniscate.toml")
+    robot = replace(scene.robot, rods=tuple(replace(rod, line_density=0.3) for rod in scene.robot.rods))
+    scene = replace(scene, robot=robot, trajectory=replace(scene.trajectory, period=1.5), duration=1.5)
+    scene = replace(scene, plant=replace(scene.plant, inertia="condensed"))
+    reference = feed_forward(scene, robot, scene.start(), 5, "condensed")
+    plant, x, errors = scene.make_plant(), reference.states[0], []
+    plant.reset(x, scene.start())
+    for k in range(scene.n_periods):
+        for _ in range(round(scene.period / plant.dt)):
+            x = plant.step(x, reference.inputs[k])
+        errors.append(np.linalg.norm(x[:2] - reference.states[k + 1, :2]))
+    assert np.ptp(reference.states[:, 0]) > 0.02
+    assert max(errors) < 5e-5

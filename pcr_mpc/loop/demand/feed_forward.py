@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from ... import interrupt
 from ...control.qp import Reference
@@ -104,10 +106,13 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     q = np.stack([eq.q for eq in poses])
     if inertia != "none":
         plant = Plant(robot, inertia=inertia)
+        rate_of = _differences(t)
         for _ in range(_MOST_SWEEPS):
             plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
-            momentum, push, own = _momentum(plant, carried, p, v, q, np.gradient(q, t, axis=0, edge_order=2))
-            forces = loads + push - np.gradient(momentum, t, axis=0, edge_order=2) - robot.drag * v
+            momentum, push, own, coupling = _momentum(plant, carried, p, v, q, rate_of @ q)
+            wanted = loads + push - rate_of @ momentum - robot.drag * v
+            # The turn that makes up for what is missing moves the rods' mass, too.
+            forces = wanted - _moved_by(wanted - forces, poses, coupling, rate_of)
             poses = poses_along(robot, pose, t, p, forces, resting, a)
             before, q = q, np.stack([eq.q for eq in poses])
             change = float(np.abs(q - before).max())
@@ -233,17 +238,39 @@ def _first_lost(robot: Robot, pose: Equilibrium, p: np.ndarray, forces: np.ndarr
     return None
 
 
+def _differences(t: np.ndarray) -> sparse.csr_array:
+    """Derivatives by t of what is known at equally spaced times, of second order: a matrix."""
+    return sparse.csr_array(np.gradient(np.eye(len(t)), t, axis=0, edge_order=2))
+
+
+def _moved_by(
+    missing: np.ndarray, poses: list[Equilibrium], coupling: np.ndarray, rate_of: sparse.csr_array
+) -> np.ndarray:
+    """What the rods' mass takes, (K, 2) [N], where the motors turn to make up for forces that are missing.
+
+    With turns dq = G^+ f by forces f that the rods carry, f + d/dt(M_pq d/dt dq) is missing.
+    """
+    levers = np.stack([np.linalg.pinv(eq.dforce_dq) for eq in poses])
+    twice = sparse.csr_array(sparse.kron(rate_of, np.eye(2)))
+    turned = sparse.block_diag(list(coupling)) @ sparse.kron(rate_of, np.eye(coupling.shape[2]))
+    taken = twice @ turned @ sparse.block_diag(list(levers))
+    carried = splu(sparse.csc_array(sparse.eye_array(missing.size) + taken)).solve(missing.ravel())
+    return np.asarray(missing.ravel() - carried).reshape(missing.shape)
+
+
 def _momentum(
     plant: Plant, carried: np.ndarray, p: np.ndarray, v: np.ndarray, q: np.ndarray, rates: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Momentum of tip and rods [N s], dT/dp [N], M_pp^-1 pi with what is carried [m/s] at K poses, (K, 2) each."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Momentum of tip and rods [N s], dT/dp [N], M_pp^-1 pi with what is carried [m/s] at K poses, (K, 2) each; M_pq,
+    (K, 2, n)."""
     n = 2 + plant.robot.n_rods
     momentum, push, own = (np.empty_like(p) for _ in range(3))
+    coupling = np.empty((len(p), 2, n - 2))
     for k in range(len(p)):
         interrupt.check()
         mass, slopes = plant.mass(p[k], q[k])
         w = np.concatenate([v[k], rates[k]])
-        momentum[k] = mass[:2] @ w
+        momentum[k], coupling[k] = mass[:2] @ w, mass[:2, 2:]
         push[k] = [w @ slopes[:, axis].reshape(n, n, order="F") @ w / 2 for axis in (0, 1)]
         own[k] = np.linalg.solve(mass[:2, :2] + carried[k] * np.eye(2), momentum[k] + carried[k] * v[k])
-    return momentum, push, own
+    return momentum, push, own, coupling
