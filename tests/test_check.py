@@ -189,6 +189,38 @@ def test_a_scene_as_a_table_and_a_picture(found, tmp_path):
     assert image.imread(tmp_path / "scene.png").std() > 0.05
 
 
+def test_the_mode_of_the_robot_comes_first(found):
+    """Though six of many modes are shown, and others have less energy."""
+    rows = [
+        {
+            "mode": f"{i:03b}",
+            "possible": True,
+            "torque_Nm": 1.0,
+            "strain": None,
+            "least_stiffness_N_m": 1.0,
+            "energy_J": i,
+        }
+        for i in range(8)
+    ]
+    figures = {**found.figures, "modes": rows, "start": {**found.figures["start"], "mode": "111"}}
+    lines = check_table(replace(found, figures=figures)).splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("modes that hold"))
+    assert lines[first + 2].startswith("111 (this one)")
+    assert "and 2 more" in lines[first + 8]
+
+
+def test_tips_that_overload_motors_are_no_workspace(scene):
+    """All are when the motors have no torque to speak of, none when they have much."""
+    areas = {}
+    for limit in (0.8, 1e3):
+        case = replace(scene, robot=replace(scene.robot, torque_limit=limit))
+        space = examine(case, modes=False).figures["workspace"]
+        areas[limit] = space["area_m2"], space["overloaded_m2"]
+    assert areas[1e3][1] == 0.0
+    assert sum(areas[0.8]) == pytest.approx(areas[1e3][0])
+    assert 0.0 < areas[0.8][0] < areas[1e3][0]
+
+
 def test_a_picture_of_somebody_is_left_alone(tmp_path, capsys):
     (tmp_path / "mine.png").write_bytes(b"mine")
     assert main(["check", "lemniscate", "--picture", str(tmp_path / "mine.png")]) == 1

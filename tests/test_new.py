@@ -57,6 +57,41 @@ def test_stiffness_and_density_are_those_of_the_wire(mine):
     assert robot.strain_limits == pytest.approx([MATERIALS["nitinol"].strain_limit] * 2)
 
 
+def test_strips_of_spring_steel(tmp_path):
+    """12 x 0.4 mm, by hand: E w t^3 / 12, rho w t; and it tracks."""
+    folder = tmp_path / "mine"
+    words = ["--material", "spring_steel", "--width", "12e-3", "--thickness", "0.4e-3", "--length", "0.42"]
+    assert main(["new", str(folder), *words]) == 0
+    robot = load_robot(folder / "robot.toml")
+    assert robot.stiffnesses == pytest.approx([206e9 * 12e-3 * 0.4e-3**3 / 12] * 2)
+    assert [rod.line_density for rod in robot.rods] == pytest.approx([7850 * 12e-3 * 0.4e-3] * 2)
+    eq = load_scene(folder / "scene.toml").start()
+    assert eq.max_strain == pytest.approx(0.2e-3 * np.abs(eq.motor_torque) / robot.stiffnesses, rel=1e-2)
+    assert tracked(folder) < 1e-4
+    assert "#   pcr-mpc new mine --rods 2 --material spring_steel --width 0.012 --thickness 0.0004 --length 0.42" in (
+        folder / "robot.toml"
+    ).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--width", "0.01"], "thickness is missing"),
+        (["--thickness", "0.001"], "width is missing"),
+        (["--width", "1e-4", "--thickness", "4e-4"], "less than the thickness, 0.4 mm"),
+        (["--width", "1e-2", "--thickness", "4e-4", "--diameter", "1e-3"], "give one"),
+        (["--width", "0.05", "--thickness", "0.02"], "at least 50 times as long, 1 m"),
+        (["--width", "nan", "--thickness", "4e-4"], "width"),
+        (["--width", "12e-3", "--thickness", "1.4e-3", "--material", "spring_steel", "--length", "0.42"],
+         "nearest that works: 1.3 mm thickness"),
+    ],
+)  # fmt: skip
+def test_strips_that_are_none(tmp_path, capsys, words, problem):
+    assert main(["new", str(tmp_path / "mine"), *words]) == 1
+    assert problem in capsys.readouterr().err
+    assert not list((tmp_path / "mine").glob("*"))
+
+
 def test_strain_is_curvature_times_the_radius(mine):
     """Curvature by differences along the wire; at the clamp it is tau / EI. `new` must stay within what it bears."""
     scene = load_scene(mine / "scene.toml")

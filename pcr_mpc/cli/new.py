@@ -30,9 +30,14 @@ _NAMES = ("robot.toml", "scene.toml", "tuning.toml")
 def new(options: argparse.Namespace) -> int:
     """Run `pcr-mpc new`."""
     folder = options.folder
+    if options.diameter is not None and (options.width, options.thickness) != (None, None):
+        raise ModelError(
+            "--diameter is of round rods, --width and --thickness are of strips: give one kind", key="width"
+        )
+    diameter = Wish.diameter if options.diameter is None else options.diameter
     wish = Wish(
-        folder.resolve().name, options.rods, options.material, options.diameter, options.length, options.spacing,
-        options.tip_mass, options.motor,
+        folder.resolve().name, options.rods, options.material, diameter, options.length, options.spacing,
+        options.tip_mass, options.motor, options.width, options.thickness,
     )  # fmt: skip
     # Rather now than after the search.
     require_absent((folder / name for name in _NAMES), force=options.overwrite)

@@ -334,7 +334,10 @@ def parser() -> argparse.ArgumentParser:
     new.add_argument("folder", type=Path, metavar="NAME", help="folder to make; its last part names the robot")
     new.add_argument("--rods", type=int, default=2, help="2 to 4 (default 2)")
     new.add_argument("--material", default="nitinol", help="of the rods, such as spring_steel (default nitinol)")
-    new.add_argument("--diameter", type=float, default=1e-3, metavar="D", help="of the rods [m] (default 0.001)")
+    new.add_argument("--diameter", type=float, metavar="D", help="of the rods [m] (default 0.001)")
+    new.add_argument("--width", type=float, metavar="W", help="of rods that are upright strips [m], with --thickness "
+                     "instead of a diameter: the tip does not sag")  # fmt: skip
+    new.add_argument("--thickness", type=float, metavar="T", help="of such strips, in the plane of the robot [m]")
     new.add_argument("--length", type=float, default=0.5, metavar="L", help="of the rods [m] (default 0.5)")
     new.add_argument("--spacing", type=float, metavar="S", help="between neighbouring motors [m] (default: chosen)")
     new.add_argument("--tip-mass", type=float, metavar="M", help="pin and payload [kg] (default: chosen)")

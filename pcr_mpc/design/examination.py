@@ -56,6 +56,12 @@ class Examination:
     figures: dict[str, Any] = field(default_factory=dict)
     remarks: list[Remark] = field(default_factory=list)
 
+    def used(self, eq: Equilibrium) -> float:
+        """Share of the motors' torque or of the rods' strain that a pose uses, whichever is more."""
+        limit = self.robot.torque_limit if self.scene is None else self.scene.torque_limit
+        strain = np.nan_to_num(eq.max_strain / eq.robot.strain_limits).max()
+        return float(max(np.abs(eq.motor_torque).max() / limit, strain))
+
     @property
     def errors(self) -> list[Remark]:
         """What keeps it from running as asked."""
@@ -86,7 +92,7 @@ def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
     if modes:
         found.figures["modes"] = _modes(pose)
     found.reach = explore(pose)
-    found.figures["workspace"] = _workspace(found.reach)
+    found.figures["workspace"] = _workspace(found, found.reach)
     if scene is not None:
         found.path, reference, remarks = demands(scene, pose)
         found.figures["reference"] = reference
@@ -225,11 +231,13 @@ def _modes(pose: Equilibrium) -> list[dict[str, Any]]:
     return rows
 
 
-def _workspace(reach: Reach) -> dict[str, Any]:
+def _workspace(found: Examination, reach: Reach) -> dict[str, Any]:
     cell = reach.spacing**2
-    tips = reach.tips
+    held = [eq for eq in reach.poses if found.used(eq) <= 1.0]
+    tips = np.array([eq.p for eq in held]).reshape(-1, 2)
     return {
         "area_m2": cell * len(tips),
+        "overloaded_m2": cell * (len(reach.poses) - len(held)),
         "within_rods_reach_m2": cell * reach.within,
         "x_m": [float(tips[:, 0].min()), float(tips[:, 0].max())] if len(tips) else None,
         "y_m": [float(tips[:, 1].min()), float(tips[:, 1].max())] if len(tips) else None,

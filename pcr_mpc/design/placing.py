@@ -94,10 +94,9 @@ def used_at(eq: Equilibrium, motor: Motor) -> dict[str, float]:
 
 
 def refusal(wish: Wish, found: list[dict[str, float]], strongest: Motor) -> InfeasibleError:
-    """What is in the way, and the nearest diameter and length that would do: strain is as d/L, torque as d^4/L."""
-    what = (
-        f"{wish.rods} rods of {wish.material}, {length_text(wish.length)} long and {length_text(wish.diameter)} thick"
-    )
+    """What is in the way, and the nearest thickness and length that would do: strain is as d/L, torque as d^4/L, or as
+    t^3/L of a strip."""
+    what = f"{wish.rods} rods of {wish.material}, {length_text(wish.length)} long and {length_text(wish.thick)} thick"
     if not found:
         apart = "" if wish.spacing is None else f" with motors {length_text(wish.spacing)} apart"
         widest = 1.3 if wish.rods == 2 else 1.8 * math.sin(math.pi / wish.rods)
@@ -108,9 +107,9 @@ def refusal(wish: Wish, found: list[dict[str, float]], strongest: Motor) -> Infe
         )
 
     def thinner(used: dict[str, float]) -> float:
-        return max(used["strain"], math.sqrt(math.sqrt(used["torque"])), 1.0)
+        return max(used["strain"], math.pow(used["torque"], 1 / 4 if wish.across == "diameter" else 1 / 3), 1.0)
 
-    # Of the places, the one that wants the least change of the diameter.
+    # Of the places, the one that wants the least change of the thickness.
     least = min(found, key=thinner)
     lines, advice = [], _nearest(wish, strongest, thinner(least), max(least["strain"], least["torque"], 1.0))
     if least["strain"] > 1.0:
@@ -135,16 +134,16 @@ def refusal(wish: Wish, found: list[dict[str, float]], strongest: Motor) -> Infe
 
 
 def _nearest(wish: Wish, motor: Motor, thinner: float, longer: float) -> list[str]:
-    """Diameter and length from which the rods work, each with the other as it is: tried, not guessed."""
+    """Thickness and length from which the rods work, each with the other as it is: tried, not guessed."""
     advice = []
     if wish.spacing is not None and place(replace(wish, spacing=None), motor)[0] is not None:
         advice.append("without --spacing")
-    for key, first, step in (("diameter", wish.diameter / thinner, 0.97), ("length", wish.length * longer, 1.04)):
+    for key, first, step in ((wish.across, wish.thick / thinner, 0.97), ("length", wish.length * longer, 1.04)):
         if not 1 / _FARTHEST <= first / getattr(wish, key) <= _FARTHEST:
             continue
         for attempt in range(_ATTEMPTS):
             value = rounded(first * step ** (attempt + 1), up=step > 1, down=step < 1)
-            other = replace(wish, diameter=value) if key == "diameter" else replace(wish, length=value)
+            other = replace(wish, **{key: value})  # type: ignore[arg-type]  # one of its lengths
             if place(other, motor)[0] is not None:
                 advice.append(f"{length_text(value)} {key}")
                 break

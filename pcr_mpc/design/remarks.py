@@ -12,6 +12,7 @@ from ..loop.scene.scene import Scene
 from ..plant.motion.step_limit import longest_step
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
+from .wish import rounded
 
 NEAR = 0.85  # of a limit, from which it is near
 _FEW_PERIODS = 15.0  # of control in a swing of the tip
@@ -117,8 +118,8 @@ def about_steps(scene: Scene, mass: np.ndarray, figures: dict[str, Any]) -> tupl
             _warning(
                 "control period",
                 f"the tip swings once in {swing:.3g} s, which is {swing / scene.period:.2g} control periods of "
-                f"{scene.period:g} s; {_FEW_PERIODS:g} or more are usual: take {swing / _FEW_PERIODS:.1g} s, or a "
-                "heavier tip",
+                f"{scene.period:g} s; {_FEW_PERIODS:g} or more are usual: take "
+                f"{rounded(swing / _FEW_PERIODS, down=True):g} s, or a heavier tip",
             )
         )
     return steps, remarks

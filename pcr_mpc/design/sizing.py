@@ -112,7 +112,7 @@ def _require_swings(wish: Wish, mass: float, rod_mass: float, slowest: float, fa
         advice = (
             f"at most {rounded(most, down=True):.2g} kg (--tip-mass)"
             if most > rod_mass / 2
-            else f"about {length_text(rounded(1.05 * ratio * wish.diameter, up=True))} diameter, or "
+            else f"about {length_text(rounded(1.05 * ratio * wish.thick, up=True))} {wish.across}, or "
             f"{length_text(rounded(wish.length / math.sqrt(1.05 * ratio), down=True))} length"
         )
         raise InfeasibleError(

@@ -19,8 +19,9 @@ def files(design: Design) -> dict[str, str]:
 def command(design: Design) -> str:
     """The command that makes it."""
     wish = design.wish
-    given = {"rods": wish.rods, "material": wish.material, "diameter": wish.diameter, "length": wish.length,
-             "spacing": wish.spacing, "tip-mass": wish.tip_mass, "motor": wish.motor}  # fmt: skip
+    section = {"diameter": wish.diameter} if wish.width is None else {"width": wish.width, "thickness": wish.thickness}
+    given = {"rods": wish.rods, "material": wish.material, **section, "length": wish.length, "spacing": wish.spacing,
+             "tip-mass": wish.tip_mass, "motor": wish.motor}  # fmt: skip
     options = (f"--{key} {value:g}" if isinstance(value, float) else f"--{key} {value}"
                for key, value in given.items() if value is not None)  # fmt: skip
     return " ".join([f"pcr-mpc new {wish.name}", *options])
@@ -30,13 +31,21 @@ def robot_text(design: Design) -> str:
     """The robot's file."""
     wish, motor, material, section = design.wish, design.motor, design.wish.stuff, design.wish.section
     stiffness, density = material.youngs_modulus * section.second_moment, material.density * section.area
-    d = f"({wish.diameter:g} m)"
+    modulus, rho = f"{material.youngs_modulus:.4g} Pa", f"{material.density:.4g} kg/m^3"
+    if wish.width is None:
+        d = f"({wish.diameter:g} m)"
+        bending, mass = f"E pi d^4 / 64 = {modulus} * pi {d}^4 / 64", f"rho pi d^2 / 4 = {rho} * pi {d}^2 / 4"
+        sizes = {"diameter": (wish.diameter, "m")}
+    else:
+        w, t = f"{wish.width:g} m", f"{wish.thickness:g} m"
+        bending, mass = f"E w t^3 / 12 = {modulus} * {w} * ({t})^3 / 12", f"rho w t = {rho} * {w} * {t}"
+        sizes = {"width": (wish.width, "m; upright, out of the plane"), "thickness": (wish.thick, "m; in the plane")}
     lines = [
         f"# {wish.rods} rods of {wish.material}, a first draft by:",
         f"#   {command(design)}",
         "# Put your own numbers in, then: pcr-mpc check scene.toml. SI units.",
-        f"# EI = E pi d^4 / 64 = {material.youngs_modulus:.4g} Pa * pi {d}^4 / 64 = {stiffness:.4g} N m^2",
-        f"# line density = rho pi d^2 / 4 = {material.density:.4g} kg/m^3 * pi {d}^2 / 4 = {density:.4g} kg/m",
+        f"# EI = {bending} = {stiffness:.4g} N m^2",
+        f"# line density = {mass} = {density:.4g} kg/m",
         *_wrapped(f"{wish.material}: {material.source}"),
         f'name = "{wish.name}"',
     ]
@@ -48,7 +57,7 @@ def robot_text(design: Design) -> str:
             _line("base", base, "m; motor axis" if first else ""),
             _line("length", wish.length, "m; from clamp to pin" if first else ""),
             _line("material", wish.material, "E, density and strain limit; see the head of this file" if first else ""),
-            _line("diameter", wish.diameter, "m" if first else ""),
+            *(_line(key, size, unit if first else "") for key, (size, unit) in sizes.items()),
             _line("angle_limits", stops, "rad; stops of the motor, of the clamp or the cable" if first else ""),
         ]
     chosen = "given" if wish.tip_mass else "chosen: the tip swings slowly enough, and outweighs its rods"
@@ -72,7 +81,7 @@ def scene_text(design: Design) -> str:
     centre = design.layout.centre
     lines = [
         "# A figure of eight, from rest at its centre, as fast as the robot follows with ease.",
-        "# Other paths: kind hold, pick_and_place and more; see the page about scenes.",
+        "# Other paths: kind file, waypoints, circle and more; see the page about paths.",
         f'name = "{design.wish.name}"',
         'robot = "robot.toml"',
         _line("duration", round(design.duration, 6), "s; start-up and two laps"),

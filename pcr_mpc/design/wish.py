@@ -31,7 +31,9 @@ class Wish:
     material : str
         A key of `MATERIALS`.
     diameter, length : float
-        Of the rods [m].
+        Of the rods [m]; a strip has no diameter.
+    width, thickness : float or None
+        Of rods that are strips, which bend in the plane of their thickness [m]; both or neither.
     spacing : float or None
         Between neighbouring motors [m].
     tip_mass : float or None
@@ -48,26 +50,47 @@ class Wish:
     spacing: float | None = None
     tip_mass: float | None = None
     motor: str | None = None
+    width: float | None = None
+    thickness: float | None = None
 
     def __post_init__(self) -> None:
         if problem := name_problem(self.name):
             raise ModelError(f"name: {problem}", key="name")
         if not 2 <= self.rods <= _MOST_RODS:
             raise ModelError(f"rods is {self.rods}, expected 2 to {_MOST_RODS}", key="rods")
-        given = [key for key in ("spacing", "tip_mass") if getattr(self, key) is not None]
+        given = [key for key in ("spacing", "tip_mass", "width", "thickness") if getattr(self, key) is not None]
         check_numbers(self, {key: {"above": 0.0} for key in ("diameter", "length", *given)})
         if self.material not in MATERIALS:
             near = difflib.get_close_matches(self.material, MATERIALS, n=1)
             hint = f"did you mean {near[0]}? " if near else ""
             known = ", ".join(MATERIALS)
             raise ModelError(f"material {self.material!r} is not known; {hint}known are {known}", key="material")
-        if self.length < _SLENDER * self.diameter:
+        if (self.width is None) != (self.thickness is None):
+            missing = "width" if self.width is None else "thickness"
+            raise ModelError(f"{missing} is missing: a strip has a width and a thickness", key=missing)
+        if self.width is not None and self.width < self.thick:
             raise ModelError(
-                f"rods {length_text(self.length)} long and {length_text(self.diameter)} thick are no slender rods: "
-                f"they are to be at least {_SLENDER:g} diameters long, {length_text(_SLENDER * self.diameter)}. "
-                "Numbers are in metres",
+                f"width is {length_text(self.width)}, less than the thickness, {length_text(self.thick)}, across which "
+                "a strip bends; exchange them",
+                key="width",
+            )
+        if self.length < _SLENDER * self.thick:
+            raise ModelError(
+                f"rods {length_text(self.length)} long and {length_text(self.thick)} thick are no slender rods: "
+                f"they are to be at least {_SLENDER:g} {'diameters' if self.width is None else 'times as'} long, "
+                f"{length_text(_SLENDER * self.thick)}. Numbers are in metres",
                 key="length",
             )
+
+    @property
+    def across(self) -> str:
+        """Which of its numbers says how thick a rod is."""
+        return "diameter" if self.thickness is None else "thickness"
+
+    @property
+    def thick(self) -> float:
+        """In the plane of the robot [m]."""
+        return self.diameter if self.thickness is None else self.thickness
 
     @property
     def stuff(self) -> Material:
@@ -77,7 +100,9 @@ class Wish:
     @property
     def section(self) -> Section:
         """Of the rods."""
-        return Section.round(self.diameter)
+        if self.width is None or self.thickness is None:
+            return Section.round(self.diameter)
+        return Section.strip(self.width, self.thickness)
 
     def robot(self, layout: Layout, motor: Motor, tip_mass: float = 1.0, drag: float = 0.0) -> Robot:
         """Robot of these rods."""

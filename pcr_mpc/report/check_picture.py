@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.colors import Normalize
 
 from ..design.examination import Examination
-from ..plant.statics.equilibrium import Equilibrium
 from .style import GREY, RED, RODS, plt, save_figure
 
 _POINTS = 60
@@ -29,7 +28,7 @@ def plot_check(found: Examination, path: Path) -> None:
         axes.add_patch(plt.Circle(base, length, fill=False, color=GREY, ls=":", lw=0.9))
     axes.plot([], [], color=GREY, ls=":", lw=0.9, label="reach of a rod")
     if found.reach is not None and found.reach.poses:
-        used = np.array([_used(eq, found) for eq in found.reach.poses])
+        used = np.array([found.used(eq) for eq in found.reach.poses])
         tips, fits = found.reach.tips, used <= 1.0
         shown = axes.scatter(*tips[fits].T, c=100 * used[fits], s=42, marker="s", lw=0, cmap="viridis_r",
                              norm=Normalize(0, 100), label="tip can be held")  # fmt: skip
@@ -50,12 +49,6 @@ def plot_check(found: Examination, path: Path) -> None:
     axes.set(xlabel="x [m]", ylabel="y [m]", title=f"{found.name}: {what} and workspace")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)
     save_figure(figure, path)
-
-
-def _used(eq: Equilibrium, found: Examination) -> float:
-    limit = found.robot.torque_limit if found.scene is None else found.scene.torque_limit
-    strain = np.nan_to_num(eq.max_strain / eq.robot.strain_limits).max()
-    return float(max(np.abs(eq.motor_torque).max() / limit, strain))
 
 
 def _frame(axes: plt.Axes, found: Examination) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..design.examination import Examination
-from .tables import table
+from .tables import digits, table
 
 _MODES_SHOWN = 6
 
@@ -98,6 +98,8 @@ def _times(found: Examination) -> str:
 
 def _modes(rows: list[dict[str, Any]], start: dict[str, Any]) -> str:
     possible = sorted((row for row in rows if row["possible"]), key=lambda row: float(row["energy_J"]))
+    own = [row for row in possible if row["mode"] == start["mode"]]
+    possible = own + [row for row in possible if row not in own]
     cells = [
         (
             row["mode"] + (" (this one)" if row["mode"] == start["mode"] else ""),
@@ -122,10 +124,16 @@ def _workspace(found: Examination) -> str:
         ", ".join(f"{name} {count}" for name, count in sorted(space["ends"].items())) or "nothing but the rods' reach"
     )
     return (
-        f"workspace of this mode  {1e4 * space['area_m2']:.3g} cm^2 of {1e4 * space['within_rods_reach_m2']:.3g} cm^2 "
-        f"within the rods' reach, x {_range(space['x_m'])} m, y {_range(space['y_m'])} m\n"
+        f"workspace of this mode  {digits(1e4 * space['area_m2'])} cm^2 of "
+        f"{digits(1e4 * space['within_rods_reach_m2'])} cm^2 within the rods' reach"
+        f"{_overloaded(space)}, x {_range(space['x_m'])} m, y {_range(space['y_m'])} m\n"
         f"ways that end before    {ends}"
     )
+
+
+def _overloaded(space: dict[str, Any]) -> str:
+    area = space["overloaded_m2"]
+    return f", {digits(1e4 * area)} cm^2 more beyond torque or strain" if area else ""
 
 
 def _reference(reference: dict[str, Any]) -> str:

@@ -7,7 +7,9 @@ from typing import Any
 
 from ..design.examination import Examination
 from ..design.sizing import Design
+from ..design.wish import Wish
 from .check_tables import remarks_text
+from .tables import digits
 
 
 def new_record(chosen: Design, found: Examination, files: dict[str, str]) -> dict[str, Any]:
@@ -36,12 +38,14 @@ def new_table(chosen: Design, found: Examination) -> str:
     torque, strain = peaks["torque"], peaks["strain"]
     bases = ", ".join(f"({x:.3g}, {y:.3g})" for x, y in found.robot.bases.tolist())
     rows = [
-        ("rods", f"{wish.rods} of {wish.material}, {1e3 * wish.diameter:.3g} mm thick, {wish.length:.3g} m long: EI "
+        ("rods", f"{wish.rods} of {wish.material}, {_section(wish)}, {wish.length:.3g} m long: EI "
          f"{rod.bending_stiffness:.4g} N m^2, {1e3 * rod.line_density:.3g} g/m"),
         ("motors", f"{chosen.motor.name} at {bases} m"),
-        ("tip", f"{1e3 * chosen.tip_mass:.3g} g; it swings on its rods at {_list(start['natural_frequencies_Hz'])} Hz"),
+        ("tip", f"{digits(1e3 * chosen.tip_mass)} g; it swings on its rods at "
+         f"{_list(start['natural_frequencies_Hz'])} Hz"),
         ("path", f"figure of eight, {1e3 * chosen.size[0]:.3g} x {1e3 * chosen.size[1]:.3g} mm in {chosen.lap:.3g} s"),
-        ("workspace", f"{1e4 * space['area_m2']:.3g} cm^2 in mode {start['mode']}"),
+        ("workspace", f"{digits(1e4 * space['area_m2'])} cm^2 in mode {start['mode']}, with strain and torque within "
+         "their limits"),
         ("torque", f"{torque['value']:.3g} N m at most, {100 * torque['used']:.0f} % of what the motor has in motion"),
         ("strain", f"{100 * strain['value']:.2g} % at most, {100 * strain['used']:.0f} % of the material's limit"),
         ("motor rate", f"{peaks['motor rate']['value']:.3g} rad/s at most, {100 * peaks['motor rate']['used']:.0f} %"),
@@ -50,6 +54,11 @@ def new_table(chosen: Design, found: Examination) -> str:
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {text}" for name, text in rows]
     return "\n".join([*lines, "", remarks_text(found)])
+
+
+def _section(wish: Wish) -> str:
+    strip = "" if wish.width is None else f"strips {digits(1e3 * wish.width)} mm wide, "
+    return f"{strip}{digits(1e3 * wish.thick)} mm thick"
 
 
 def _list(values: list[float]) -> str:

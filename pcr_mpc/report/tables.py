@@ -26,6 +26,11 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(line).rstrip() for line in lines)
 
 
+def digits(value: float, count: int = 3) -> str:
+    """Write a number with so many digits, and without an exponent below a million."""
+    return f"{float(f'{value:.{count}g}'):g}"
+
+
 def without_rounding(values: np.ndarray, scale: float) -> np.ndarray:
     """Round to a billionth of a scale, so that what is zero but for rounding reads as zero, and never as -0."""
     return np.asarray(np.where(np.abs(values) < 1e-9 * scale, 0.0, values))
