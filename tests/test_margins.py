@@ -214,6 +214,13 @@ def test_one_controller_pushes_as_new_ones_do(lemniscate):
     assert np.array_equal(again.run.x, new.run.x)
 
 
+def test_what_a_solver_leaves_of_a_push_is_not_the_loop(lemniscate):
+    """With two periods of horizon and small weights OSQP's tolerance is a tenth of the push."""
+    told = replace(lemniscate, duration=1.2).tuned(replace(load_tuning(CONTROLLERS / "frozen.toml"), horizon=2))
+    assert told.tuning.solver == "osqp"
+    assert push_dies_away(told, told)
+
+
 def test_a_stiffer_robot_stands_where_the_softer_one_does(lemniscate):
     """Holding takes as much more torque, which scene and motors then have."""
     assert scaled_scene(lemniscate, stiffness=2.5).start().motor_torque == pytest.approx(
