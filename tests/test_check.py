@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from pcr_mpc import Plant, load_robot, load_scene, shipped
+from pcr_mpc import Plant, load_robot, load_scene, make_controller, shipped, simulate
 from pcr_mpc.cli import main
 from pcr_mpc.design.examination import examine
 from pcr_mpc.design.reach import tips_within
@@ -92,6 +92,19 @@ def test_what_the_reference_asks_is_what_differences_say(scene, found):
     assert peaks["motor rate"]["limit"] == scene.robot.rate_limit
     assert peaks["torque"]["used"] == pytest.approx(peaks["torque"]["value"] / scene.torque_limit)
     assert found.errors == []
+
+
+def test_rods_that_the_controller_knows_to_be_heavy_are_heavy_here_too(scene):
+    """What is asked of the motors is what a run says; without the rods' inertia it is something else."""
+    robot = replace(scene.robot, rods=tuple(replace(rod, line_density=0.3) for rod in scene.robot.rods))
+    asked = {}
+    for inertia in ("none", "condensed"):
+        tuning = replace(scene.tuning, model=replace(scene.tuning.model, inertia=inertia))
+        case = replace(scene, robot=robot, tuning=tuning, duration=1.0)
+        asked[inertia] = examine(case, modes=False).figures["reference"]["peaks"]["motor rate"]["value"]
+    run = simulate(case, case.make_plant(), make_controller(case))
+    assert run.asked["rate_rad_s"]["asked"] == pytest.approx(asked["condensed"], rel=1e-3)  # it ends a horizon later
+    assert abs(asked["condensed"] - asked["none"]) > 0.02 * asked["none"]
 
 
 def test_what_motion_does_not_tell_is_said(found):

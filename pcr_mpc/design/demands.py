@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import PCRError
-from ..loop.demand.feasibility import reference_demand, reference_excess
-from ..loop.demand.feed_forward import InverseDynamics, feed_forward
+from ..loop.demand.feasibility import reference_demand, reference_excess, reference_of
+from ..loop.demand.feed_forward import InverseDynamics
 from ..loop.references.trajectory import sampled
 from ..loop.scene.scene import Scene
 from ..plant.statics.equilibrium import Equilibrium
@@ -42,7 +42,7 @@ def demands(scene: Scene, pose: Equilibrium) -> tuple[np.ndarray | None, dict[st
         "frequency_Hz": _ratio(acceleration, speed) / (2 * math.pi),
     }
     try:
-        reference = feed_forward(scene, scene.robot, pose, 0)
+        reference = reference_of(scene, pose)
     except PCRError as error:
         return p, figures, [Remark("error", "reference", str(error))]
     excess = [Remark("error", "reference", line) for line in reference_excess(scene, reference, pose)]

@@ -41,7 +41,12 @@ def check_scene(scene: Scene) -> list[str]:
     pose = scene.start()
     if scene.trajectory is None:
         return []
-    return reference_excess(scene, feed_forward(scene, scene.robot, pose, 0), pose)
+    return reference_excess(scene, reference_of(scene, pose), pose)
+
+
+def reference_of(scene: Scene, pose: Equilibrium) -> InverseDynamics:
+    """Inverse dynamics of the reference with the rods' inertia that the scene's controller knows."""
+    return feed_forward(scene, scene.robot, pose, 0, scene.tuning.model.inertia if scene.tuning else "none")
 
 
 def reference_excess(
@@ -55,12 +60,13 @@ def reference_excess(
     reference : InverseDynamics
     pose : Equilibrium, optional
         In which it starts: by how much it is to be slower is solved for, which takes as long as the inverse dynamics
-        do. None: to first order.
+        do. None, and where the rods have inertia: to first order.
     robot : Robot, optional
         For which the inverse dynamics are; by default the scene's.
     """
     count, period, poses = scene.n_periods, scene.period, scene.pose_limits
     robot = robot or scene.robot
+    pose = pose if reference.inertia == "none" else None  # slower ones are solved for without
     slowed = Slowed.of(scene, robot, reference)
     rates, changes, torques = slowed.motors(1.0)
     found = []

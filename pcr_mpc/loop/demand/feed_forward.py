@@ -52,6 +52,8 @@ class InverseDynamics(Frozen, Reference):
         Least of the rods (see `least_rod_margin`).
     strains : ndarray, shape (K, n)
         Largest of each rod; NaN where no thickness is known.
+    inertia : str
+        Of the rods, that was reckoned with.
     """
 
     angles_per_force: np.ndarray
@@ -60,6 +62,7 @@ class InverseDynamics(Frozen, Reference):
     stiffness: np.ndarray
     rod_margin: np.ndarray
     strains: np.ndarray
+    inertia: str = "none"
 
 
 def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, inertia: str = "none") -> InverseDynamics:
@@ -129,11 +132,11 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
             )
         v = own
     rates = np.diff(q, axis=0) / scene.period
-    return _inverse_dynamics(np.hstack([p, v, q]), rates, forces, poses)
+    return _inverse_dynamics(np.hstack([p, v, q]), rates, forces, poses, inertia)
 
 
 def _inverse_dynamics(
-    states: np.ndarray, rates: np.ndarray, forces: np.ndarray, poses: list[Equilibrium]
+    states: np.ndarray, rates: np.ndarray, forces: np.ndarray, poses: list[Equilibrium], inertia: str
 ) -> InverseDynamics:
     levers = np.stack([np.linalg.pinv(eq.dforce_dq) for eq in poses])
     return InverseDynamics(
@@ -146,6 +149,7 @@ def _inverse_dynamics(
         stiffness=np.array([eq.stiffness_eigenvalues[0] for eq in poses]),
         rod_margin=np.array([least_rod_margin(eq) for eq in poses]),
         strains=np.stack([eq.max_strain for eq in poses]),
+        inertia=inertia,
     )
 
 
@@ -172,7 +176,7 @@ def held(
     end = poses_along(robot, pose, np.full(len(p), np.nan), p, forces, forces, np.zeros_like(p))[-1]
     state = np.concatenate([end.p, np.zeros(2), end.q])
     states, forces = np.tile(state, (count + 1, 1)), np.tile(forces[-1], (count + 1, 1))
-    return _inverse_dynamics(states, np.zeros((count, robot.n_rods)), forces, [end] * (count + 1))
+    return _inverse_dynamics(states, np.zeros((count, robot.n_rods)), forces, [end] * (count + 1), "none")
 
 
 def poses_along(
