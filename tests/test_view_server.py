@@ -281,3 +281,22 @@ def test_the_command_prints_the_address_and_ends_by_ctrl_c_with_nothing_left(tmp
     assert "Warning" not in err
     with pytest.raises(ConnectionRefusedError):
         get(host, int(port), "/")
+
+
+def test_a_port_that_is_none_or_taken_is_said(served):
+    with pytest.raises(OutputError, match="65535"):
+        ViewServer(lambda: None, ("127.0.0.1", 65536), Path())
+    scene = load_scene(Path("models/scenes/release.toml"))
+    second = ViewServer(lambda: Session(scene), served.server.address, Path())
+    with pytest.raises(OutputError, match="--port"):
+        second.serve(lambda _: None)
+
+
+def test_what_takes_a_while_is_told_to_all(served):
+    with served.socket() as socket:
+        ask(socket, do="controller", name="lqr")
+        assert until(socket, always, "busy")["on"]
+        assert not until(socket, always, "busy")["on"]
+        until(socket, lambda frame: frame["controller"] == "lqr")
+        ask(socket, do="controller", name="lemniscate")
+        until(socket, lambda frame: frame["controller"] == "lemniscate")

@@ -56,6 +56,7 @@ _COMMANDS: dict[str, tuple[dict[str, _Check], Callable[..., None]]] = {
 }
 # Of which only the last one counts, and those that are the server's own business.
 LATEST = ("drag", "motor", "target")
+SLOW = ("mode", "controller", "set", "reset")  # a controller may be made for them, and its machine code built
 _SERVERS: dict[str, dict[str, _Check]] = {"seen": {"n": _whole}, "steer": {}, "ghosts": {"on": _switch}}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -67,3 +68,11 @@ class Page:
 def text_of(kind: str, **more: Any) -> str:
     """A message to a page."""
     return json.dumps({"kind": kind, **more}, separators=(",", ":"))
+
+
+def quiet() -> logging.Logger:
+    """Where the library may say what goes wrong with a connection; here nobody listens."""
+    logger = logging.getLogger("pcr_mpc.view")
+    logger.addHandler(logging.NullHandler())
+    logger.propagate = False
+    return logger

@@ -16,7 +16,7 @@ from ..loop.scene.scene import Scene
 from ..loop.scene.settings import Payload
 from ..plant.robot import Robot
 from .pilot import Pilot
-from .rig import Rig
+from .rig import Rig, snapping
 
 LONGEST = 120.0  # s
 
@@ -108,7 +108,7 @@ class Recorder:
                 scene, duration=periods * scene.period, start_tip=None, start_mode=None,
                 start_motors=tuple(self._pose.q.tolist()), start_velocity=tuple(self._velocity.tolist()),
                 trajectory=_recorded(t, reference) if tracked else None, payload=self._payload(steps),
-                plant=replace(scene.plant, on_snap="jump"), finding=None,
+                plant=snapping(scene), finding=None,
             ),
             controller=pilot.name, plant=f"{rig.plant.method}, {rig.plant.integrator}, dt = {1e3 * rig.dt:g} ms",
             seed=self._seed, pose=self._pose, dt=scene.plant.dt, t=t, x=x,

@@ -66,7 +66,8 @@ def _frames(run: Run) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     scene = run.scene
     settings = scene.plant if run.rung is None else run.rung
     # Another engine's rods, or those of a yardstick, are drawn as the quasi-static ones at the same tip and angles.
-    plant = Plant(scene.robot.plain() if settings.rods == "plain" else scene.robot, on_snap="jump", dt=run.dt)
+    robot = scene.robot.plain() if settings.rods == "plain" else scene.robot
+    plant = Plant(robot, on_snap="raise" if robot.needs_shooting else "jump", dt=run.dt)
     plant.reset(run.x[0], run.pose)
     stride = max(1, round(1.0 / (_FRAMES * run.dt)), math.ceil(len(run.t) / _MOST))
     last = len(run.t) - 1

@@ -13,6 +13,7 @@ from ..loop.hardware.camera import IDEAL, Pictures
 from ..loop.run.drive import drive_of
 from ..loop.run.untold_delay import UntoldDelay
 from ..loop.scene.scene import Scene
+from ..loop.scene.settings import PlantSettings
 from ..plant.motion.plant import Plant
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.free_tip import inverse_statics
@@ -43,7 +44,7 @@ class Rig:
     x : ndarray, shape (4 + n,)
         State [m, m/s, rad].
     plant : Plant
-        Rods that lose their shape snap, and do not end the run.
+        Rods that lose their shape snap, where that can be followed (see `snapping`).
     stiffness, dashpot : float
         Of the spring that pulls the tip [N/m], [N s/m].
     pull : ndarray, shape (2,), or None
@@ -58,7 +59,7 @@ class Rig:
 
     def __init__(self, scene: Scene, pose: Equilibrium, velocity: np.ndarray, seed: int = 0) -> None:
         self.scene, self.dt = scene, scene.plant.dt
-        self.plant: Plant = replace(scene.plant, on_snap="jump").make(scene.robot)
+        self.plant: Plant = snapping(scene).make(scene.robot)
         n = scene.robot.n_rods
         self.x = np.concatenate([pose.p, velocity, pose.q])
         self.plant.reset(self.x, pose)
@@ -86,7 +87,7 @@ class Rig:
         """Take other motors and sensors where the robot stands in ``pose``; commands on the way are lost."""
         if scene.robot != self.scene.robot or scene.plant != self.scene.plant:
             payload = self.plant.payload
-            self.plant = replace(scene.plant, on_snap="jump").make(scene.robot)
+            self.plant = snapping(scene).make(scene.robot)
             self.plant.reset(self.x, pose)
             self._snapped = 0
             if payload:
@@ -163,6 +164,12 @@ class Rig:
     def equilibrium(self) -> Equilibrium:
         """Everything about the rods as they are."""
         return self.plant.equilibrium(self.x)
+
+
+def snapping(scene: Scene) -> PlantSettings:
+    """The plant of a scene whose rods snap where that can be followed; elsewhere it fails there."""
+    robot = scene.robot.plain() if scene.plant.rods == "plain" else scene.robot
+    return replace(scene.plant, on_snap="raise" if robot.needs_shooting else "jump")
 
 
 def pose_of_mode(scene: Scene, mode: str) -> Equilibrium:

@@ -13,7 +13,7 @@ from typing import Any
 
 from ..errors import OutputError, PCRError
 from ..files import saved
-from .commands import LATEST, Message, apply
+from .commands import LATEST, SLOW, Message, apply
 from .frames import about, frame
 from .session import Session
 
@@ -37,7 +37,8 @@ class Runner(threading.Thread):
         () -> Session; called in this thread, to which its solvers belong.
     publish : callable
         (kind, what) -> None; called from this thread, with "about" (dict), "start" (robot, pose, mode), "frame"
-        (number, text, q), "error" (sender, id, text), "saved" (dict), "ended" (error or None).
+        (number, text, q), "error" (sender, id, text), "busy" (whether what takes a while has begun, or is done),
+        "saved" (dict), "ended" (error or None).
     folder : Path
         Where recordings go, each into a folder of its own.
     """
@@ -125,12 +126,17 @@ class Runner(threading.Thread):
                 sender, message = self._asked.popleft()
             if "id" in message:
                 self._heard, self._felt = message["id"], 0.0
+            slow = message["do"] in SLOW
+            if slow:
+                self._publish("busy", True)
             try:
                 apply(session, message)
             except (PCRError, ValueError) as error:
                 self._publish("error", (sender, message.get("id"), str(error)))
             except Exception as error:  # a fault of ours ends no session
                 self._publish("error", (sender, message.get("id"), f"{type(error).__name__}: {error}"))
+            if slow:
+                self._publish("busy", False)
 
     def _show(self, session: Session) -> None:
         try:

@@ -27,7 +27,7 @@ from ..study.workspace_sheet import explore, make_mesh
 from .frames import centrelines, rounded
 
 _SPACING = 0.085  # of the lattice of tips, in lengths of the shortest rod
-_FORMAT = 1  # of a cached workspace
+_FORMAT = 3  # of a cached workspace
 _COARSE = 3  # starts of the search for ghosts in a rod length
 _FAR = 0.35  # rad, by which motors may turn until ghosts are looked for anew
 
@@ -97,7 +97,8 @@ def find_workspace(pose: Equilibrium) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``cells``: polygons of points [m], with the softest stiffness of each [N/m]; ``edge``: pairs of points, with the
+        ``cells``: polygons of points [m], with the softest stiffness of each [N/m] and whether the motors are within
+        their stops there; ``edge``: pairs of points, with the
         reason of each. Or ``problem``, why there is none.
     """
     robot = pose.robot
@@ -112,16 +113,24 @@ def find_workspace(pose: Equilibrium) -> dict[str, Any]:
                 return found
     sheet = explore(pose, _SPACING * float(robot.lengths.min()), progress=False)
     mesh = make_mesh(sheet)
-    cells = [
-        [rounded([mesh.vertices[i].p for i in polygon], 4),
-         rounded(np.mean([mesh.vertices[i].stiffness_eigenvalues[0] for i in polygon]), 2)]
-        for polygon in mesh.polygons
-    ]  # fmt: skip
+    beyond = [_beyond_stops(robot, eq.q) for eq in mesh.vertices]
+    cells: list[list[Any]] = []
+    stops: list[list[Any]] = []
+    for polygon in mesh.polygons:
+        softest = rounded(np.mean([mesh.vertices[i].stiffness_eigenvalues[0] for i in polygon]), 2)
+        corners = [(mesh.vertices[i].p, beyond[i]) for i in polygon]
+        for sign, within in ((1.0, True), (-1.0, False)):
+            part = _cut([(p, sign * excess) for p, excess in corners])
+            if len(part) > 2:
+                cells.append([rounded([p for p, _ in part], 4), softest, within])
+            ends = [p for p, excess in part if excess == 0.0]
+            if within and len(ends) == 2:
+                stops.append([rounded(ends, 4), "stops"])
     edge = [
         [rounded([mesh.vertices[a].p, mesh.vertices[b].p], 4), reason]
         for (a, b), reason in zip(mesh.border.tolist(), mesh.reasons, strict=True)
     ]
-    made = {"format": _FORMAT, "cells": cells, "edge": edge}
+    made = {"format": _FORMAT, "cells": cells, "edge": edge + stops}
     with suppress(OSError):  # of a full disk
         if cached is not None:
             write_text(cached, json.dumps(made, separators=(",", ":")))
@@ -129,10 +138,28 @@ def find_workspace(pose: Equilibrium) -> dict[str, Any]:
 
 
 def _digest(robot: Robot, mode: str) -> str:
-    """Of what a workspace rests on: limits of the motors do not end it."""
-    rods = [(rod.base, rod.length, rod.bending_stiffness) for rod in robot.rods]
+    """Of what a workspace rests on."""
+    rods = [(rod.base, rod.length, rod.bending_stiffness, rod.angle_limits) for rod in robot.rods]
     about = rods, robot.tip_mass, robot.gravity, mode, _SPACING, _FORMAT
     return hashlib.sha256(pickle.dumps(about)).hexdigest()[:16]
+
+
+def _beyond_stops(robot: Robot, q: np.ndarray) -> float:
+    """How far a motor is beyond its stop, the worst of all, on whatever turn; negative within [rad]."""
+    lower, upper = robot.angle_limits.T
+    away = (q - (lower + upper) / 2 + np.pi) % (2 * np.pi) - np.pi
+    return float((np.abs(away) - (upper - lower) / 2).max())
+
+
+def _cut(corners: list[tuple[np.ndarray, float]]) -> list[tuple[np.ndarray, float]]:
+    """The part of a polygon on which a number that its corners have is not positive; it is 0.0 where it was cut."""
+    part: list[tuple[np.ndarray, float]] = []
+    for (a, at_a), (b, at_b) in zip(corners, corners[1:] + corners[:1], strict=True):
+        if at_a <= 0.0:
+            part.append((a, at_a))
+        if (at_a <= 0.0) != (at_b <= 0.0) and at_a != 0.0 and at_b != 0.0:
+            part.append((a + at_a / (at_a - at_b) * (b - a), 0.0))
+    return part
 
 
 _last: tuple[Robot, np.ndarray, list[Equilibrium]] | None = None  # of this process: ghosts are followed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import sys
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from ..errors import OutputError, PCRError
 from ..plant.robot import Robot
 from .commands import LONGEST, MessageError, read
 from .door import answer, is_loopback, is_socket, refusal
-from .pages import Page, text_of
+from .pages import Page, quiet, text_of
 from .runner import Runner
 from .scenery import Scenery
 from .session import Session
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 _LISTEN = 0.05  # s, between looks at whether to end
 _PAGES = 16  # at once
+_TURN = 1e-3  # s, after which threads take turns: a command does not wait for the robot
 _GHOSTS = 0.1  # s between two looks for ghosts
 
 
@@ -70,6 +72,8 @@ class ViewServer:
         if not (local or anywhere):
             raise OutputError(f"{host} is no loopback address: whoever can see the page's address there moves the "
                               "robot; if that is meant, say --anywhere", path=host)  # fmt: skip
+        if not 0 <= address[1] < 1 << 16:
+            raise OutputError(f"port is {address[1]}, expected 0 (any that is free) to 65535", path=host)
         self.token = secrets.token_urlsafe(16)
         self.address = address
         self.counts: Counter[str] = Counter()
@@ -98,17 +102,21 @@ class ViewServer:
         KeyboardInterrupt
             On Ctrl-C; nothing is left running.
         """
-        scenery = Scenery()
+        # Ghosts, which are asked for, do not wait for the workspace.
+        self._behind, self._other = Scenery(), Scenery()
+        before = sys.getswitchinterval()
+        sys.setswitchinterval(_TURN)
         try:
-            asyncio.run(self._main(scenery, tell, until))
+            asyncio.run(self._main(tell, until))
         finally:
-            scenery.end()
+            sys.setswitchinterval(before)
+            self._end_scenery()
 
-    async def _main(self, scenery: Scenery, tell: Callable[[str], None], until: Callable[[], bool]) -> None:
+    async def _main(self, tell: Callable[[str], None], until: Callable[[], bool]) -> None:
         from websockets.asyncio.server import serve
 
         loop = asyncio.get_running_loop()
-        self._ready, self._loop, self._scenery = asyncio.Event(), loop, scenery
+        self._ready, self._loop = asyncio.Event(), loop
 
         def publish(kind: str, what: Any) -> None:
             with suppress(RuntimeError):  # the loop has ended meanwhile
@@ -124,7 +132,7 @@ class ViewServer:
             server: Server
             async with serve(
                 self._connected, *self.address, process_request=self._requested, compression=None, max_size=LONGEST,
-                max_queue=64, open_timeout=5, close_timeout=1, ping_interval=20, server_header=None, logger=_quiet(),
+                max_queue=64, open_timeout=5, close_timeout=1, ping_interval=20, server_header=None, logger=quiet(),
             ) as server:  # fmt: skip
                 self.address = self.address[0], next(iter(server.sockets)).getsockname()[1]
                 tell(self.url)
@@ -141,8 +149,12 @@ class ViewServer:
             raise OutputError(f"cannot listen on {where}: {error}; give another --port", path=where) from None
         finally:
             self._over = True
-            scenery.end()
+            self._end_scenery()
             await loop.run_in_executor(None, runner.end)
+
+    def _end_scenery(self) -> None:
+        for each in (self._behind, self._other):
+            each.end()
 
     def _raise(self) -> None:
         if self._failure is not None:
@@ -163,8 +175,9 @@ class ViewServer:
             self._robot = what[0]
             self._draw_workspace(*what)
         elif kind == "error":
-            sender, number, message = what
-            sender.tell(text_of("error", id=number, message=message))
+            what[0].tell(text_of("error", id=what[1], message=what[2]))
+        elif kind == "busy":
+            self._tell_all(text_of("busy", on=what))
         elif kind == "saved":
             self._tell_all(text_of("saved", **what))
         elif kind == "ended" and not self._over:
@@ -179,7 +192,7 @@ class ViewServer:
         self._kept.pop("workspace", None)
 
         def find() -> None:
-            found = self._scenery.workspace(pose)
+            found = self._behind.workspace(pose)
             if found is not None and not self._over:
                 self._loop.call_soon_threadsafe(self._keep, "workspace", text_of("workspace", mode=mode, **found))
 
@@ -202,7 +215,7 @@ class ViewServer:
             still = last is not None and bool(np.abs(q - last).max() < 1e-3)
             if still and whole:
                 continue
-            found = await asyncio.to_thread(self._scenery.ghosts, self._robot, q, anew=still)
+            found = await asyncio.to_thread(self._other.ghosts, self._robot, q, anew=still)
             if found is None:
                 return
             last, whole = q, bool(found.get("all", True))
@@ -285,13 +298,3 @@ class ViewServer:
         for each in self._pages:
             free = self._steering is None
             each.tell(text_of("role", steers=self._steering is each, free=free, pages=len(self._pages)))
-
-
-def _quiet() -> Any:
-    """Where the library may say what goes wrong with a connection; here nobody listens."""
-    import logging
-
-    logger = logging.getLogger("pcr_mpc.view")
-    logger.addHandler(logging.NullHandler())
-    logger.propagate = False
-    return logger

@@ -1,8 +1,11 @@
 """A run in a page, opened from a file."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pcr_mpc import load_scene, make_controller, shipped, simulate
 from pcr_mpc.cli import main
 from pcr_mpc.loop.run.run import load_run
 from tests.browser.conftest import SHOTS, wait
@@ -11,7 +14,8 @@ from tests.browser.conftest import SHOTS, wait
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    assert main(["track", "lemniscate", "--no-pictures", "--out", str(folder)]) == 0
+    scene = replace(load_scene(shipped("lemniscate")), duration=2.0)
+    simulate(scene, scene.make_plant(), make_controller(scene)).save(folder)
     assert main(["replay", str(folder), "--out", str(folder / "page.html")]) == 0
     return folder
 

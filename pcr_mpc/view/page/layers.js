@@ -5,6 +5,7 @@ const REASONS = {
   "type 2": ["--type2", [], "fold: the tip snaps"],
   "type 1": ["--type1", [7, 4], "motors lose a direction"],
   "rod limit": ["--type2", [2, 3], "limit of a rod"],
+  stops: ["--ink", [5, 5], "stop of a motor"],
   reach: ["--other", [1, 4], "rod stretched out"],
 };
 const FLASH = 1.6;  // s
@@ -13,8 +14,9 @@ class Layers {
   drawWorkspace(c) {
     c.save();
     c.fillStyle = this.colour["--space"];
-    for (const [points, stiffness] of this.workspace.cells) {
-      c.globalAlpha = 0.06 + 0.2 * Math.min(1, Math.max(0, Math.log10(Math.max(stiffness, 1)) / 2.3));
+    for (const [points, stiffness, within] of this.workspace.cells) {
+      // Where a motor would be beyond its stop, there is hardly a shade.
+      c.globalAlpha = within ? 0.1 + 0.22 * Math.min(1, Math.max(0, Math.log10(Math.max(stiffness, 1)) / 2.3)) : 0.05;
       c.beginPath();
       points.forEach((p, i) => { const [x, y] = this.toScreen(p); if (i) c.lineTo(x, y); else c.moveTo(x, y); });
       c.fill();

@@ -62,10 +62,15 @@
       if (message.problem) panel.banner(message.problem);
       canvas.ghosts = message.ghosts || null;
     },
+    busy(message) {
+      clearTimeout(waiting);
+      if (message.on) waiting = setTimeout(() => panel.banner("Getting ready…", 0), 400);
+      else if ($("banner").textContent === "Getting ready…") panel.banner("");
+    },
     again() { panel.forget(); },
     lost() { panel.banner("The server does not answer; trying again…", 0); lost = true; },
   };
-  let lost = false;
+  let lost = false, waiting = 0;
 
   const on = (message) => {
     if (lost && message.kind !== "lost") { lost = false; panel.banner(""); }
