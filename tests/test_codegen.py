@@ -29,10 +29,11 @@ needs_compiler = pytest.mark.skipif(
 )
 # Quick to build; no optimisation may change a bit of what it computes.
 QUICK = ["CFLAGS=-O0", "GRAPH_CFLAGS=-O0"]
+INCLUDED = ["-isystem", "osqp/public", "-isystem", "osqp/private", "-isystem", "daqp/include"]
 
 
-def generated(scene, folder):
-    assert main(["generate", str(SCENES / f"{scene}.toml"), "--out", str(folder)]) == 0
+def generated(scene, folder, solver="osqp"):
+    assert main(["generate", str(SCENES / f"{scene}.toml"), "--solver", solver, "--out", str(folder)]) == 0
     return folder
 
 
@@ -55,6 +56,17 @@ def lemniscate(tmp_path_factory):
     return generated("lemniscate", tmp_path_factory.mktemp("c") / "lemniscate")
 
 
+@pytest.fixture(scope="session")
+def by_daqp(tmp_path_factory):
+    return generated("lemniscate", tmp_path_factory.mktemp("daqp") / "lemniscate", "daqp")
+
+
+@pytest.fixture(params=["osqp", "daqp"])
+def each(request):
+    """A folder for each solver."""
+    return request.getfixturevalue({"osqp": "lemniscate", "daqp": "by_daqp"}[request.param])
+
+
 def copied(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("*.o", "*.a", "example"))
 
@@ -73,10 +85,13 @@ def test_the_lemniscate_runs_in_c_as_it_does_in_python(lemniscate):
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", ["sensors", "payload"])
-def test_a_scene_runs_in_c_as_it_does_in_python(scene, tmp_path):
-    said = run(make(generated(scene, tmp_path / scene), *QUICK))
+@pytest.mark.parametrize(
+    ("scene", "solver"), [("sensors", "osqp"), ("payload", "osqp"), ("lemniscate", "daqp"), ("limited", "daqp")]
+)
+def test_a_scene_runs_in_c_as_it_does_in_python(scene, solver, tmp_path):
+    said = run(make(generated(scene, tmp_path / scene, solver), *QUICK))
     assert said.count("rung or iterations in 0 of ") == 2
+    assert max(float(word) for word in re.findall(r"at most ([\d.e+-]+) rad/s", said)) <= 1e-9
 
 
 def hostile(rng, k, x):
@@ -98,10 +113,11 @@ def hostile(rng, k, x):
 
 @needs_compiler
 @pytest.mark.slow
-def test_the_worst_leads_to_the_same_rungs(tmp_path):
+@pytest.mark.parametrize(("solver", "most"), [("osqp", 25), ("daqp", 15)])
+def test_the_worst_leads_to_the_same_rungs(solver, most, tmp_path):
     # Few iterations and a load that throws the tip about: every rung of the ladder has its turn.
     scene = load_scene(SCENES / "lemniscate.toml")
-    scene = scene.tuned(replace(scene.tuning, max_iterations=25))
+    scene = scene.tuned(replace(scene.tuning, max_iterations=most, solver=solver))
     subject = Subject.of_scene(scene)
     write_folder(subject, None, tmp_path / "c")
     library = build(tmp_path / "c", f"CC={CC}", *QUICK)
@@ -118,7 +134,9 @@ def test_the_worst_leads_to_the_same_rungs(tmp_path):
         expected, found = in_python.step(k, measured), in_c.step(k, measured)
         assert (found.plan.fallback, found.plan.iterations) == (expected.plan.fallback, expected.plan.iterations), k
         assert found.u == pytest.approx(expected.u, abs=1e-9), k
-        assert found.plan.active == expected.plan.active, k
+        # Of a plan that is moved on, a limit counts that changes it: by rounding, which the two builds of DAQP differ in.
+        if solver == "osqp" or found.plan.fallback is None:
+            assert found.plan.active == expected.plan.active, k
         assert bool(in_c.output.doubts) == bool(expected.events), k
         rungs.add(found.plan.fallback)
         doubts += in_c.output.doubts != 0
@@ -162,8 +180,8 @@ def test_parameters_that_change_while_it_runs_do_what_retune_does(lemniscate, tm
 
 @needs_compiler
 @pytest.mark.slow
-def test_sanitisers_find_nothing(lemniscate, tmp_path):
-    folder = copied(lemniscate, tmp_path)
+def test_sanitisers_find_nothing(each, tmp_path):
+    folder = copied(each, tmp_path)
     checked = "-O0 -fsanitize=address,undefined -fno-sanitize-recover=all"
     # Instructions without an index, which is what CasADi writes, take long to be checked.
     make(folder, f"CFLAGS={checked}", "GRAPH_CFLAGS=-O0")
@@ -173,34 +191,33 @@ def test_sanitisers_find_nothing(lemniscate, tmp_path):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_no_compiler_warns_of_the_runtime(compiler, lemniscate):
+def test_no_compiler_warns_of_the_runtime(compiler, each):
     if not shutil.which(compiler):
         pytest.skip(f"there is no {compiler} here")
     own = sorted(path.name for path in (ROOT / "pcr_mpc" / "codegen" / "c").glob("*.c"))
     assert len(own) > 8
-    words = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-fsyntax-only", "-I."]
-    words += ["-isystem", "osqp/public", "-isystem", "osqp/private"]
-    done = subprocess.run([compiler, *words, *own, "pcr_tables.c"], cwd=lemniscate, capture_output=True, text=True)
+    words = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-fsyntax-only", "-I.", *INCLUDED]
+    done = subprocess.run([compiler, *words, *own, "pcr_qp.c", "pcr_tables.c"], cwd=each, capture_output=True,
+                          text=True)  # fmt: skip
     assert done.returncode == 0, done.stderr
 
 
 @needs_compiler
 @pytest.mark.slow
-def test_cpp_may_include_the_header(lemniscate, tmp_path):
+def test_cpp_may_include_the_header(each, tmp_path):
     if not shutil.which("g++"):
         pytest.skip("there is no g++ here")
     program = tmp_path / "main.cpp"
     program.write_text('#include "pcr.h"\nint main() { static pcr_plant p; return pcr_plant_init(&p, nullptr); }\n')
-    words = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-I."]
-    words += ["-isystem", "osqp/public", "-isystem", "osqp/private"]
-    done = subprocess.run(["g++", *words, str(program)], cwd=lemniscate, capture_output=True, text=True)
+    words = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-I.", *INCLUDED]
+    done = subprocess.run(["g++", *words, str(program)], cwd=each, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
 @needs_compiler
 @pytest.mark.slow
-def test_nothing_of_the_library_allocates_or_prints(lemniscate, tmp_path):
-    folder = copied(lemniscate, tmp_path)
+def test_nothing_of_the_library_allocates_or_prints(each, tmp_path):
+    folder = copied(each, tmp_path)
     make(folder, *QUICK, "libpcr.a")
     listed = subprocess.run(["nm", "-u", str(folder / "libpcr.a")], capture_output=True, text=True, check=True).stdout
     needed = {line.split()[-1] for line in listed.splitlines() if " U " in f" {line}"}
@@ -228,3 +245,11 @@ def test_files_of_others_are_left_alone(tmp_path, capsys):
     assert main(["generate", str(SCENES / "lemniscate.toml"), "--out", str(tmp_path)]) == 1
     assert "README.md" in capsys.readouterr().err
     assert (tmp_path / "README.md").read_text() == "mine"
+
+
+def test_a_folder_has_one_solver(tmp_path, capsys):
+    """Their sources would be compiled together."""
+    (tmp_path / "osqp").mkdir()
+    assert main(["generate", str(SCENES / "lemniscate.toml"), "--solver", "daqp", "--out", str(tmp_path)]) == 1
+    assert "was generated with osqp" in capsys.readouterr().err
+    assert not (tmp_path / "pcr.h").exists()

@@ -22,9 +22,9 @@ def generate(options: argparse.Namespace) -> int:
     if tuning is not None:
         tuning = tuning if options.solver is None else replace(tuning, solver=options.solver)
         scene = scene.tuned(tuning)
-    check_scope(scene, tuning)
+    tuning = check_scope(scene, tuning)
     folder = options.out or Path("build") / scene.name
-    require_free_folder(folder, force=options.overwrite)
+    require_free_folder(folder, tuning.solver, force=options.overwrite)
     subject = Subject.of_scene(scene, tuning)
     run = recorded(subject, progress=True)
     write_folder(subject, run, folder)

@@ -9,6 +9,12 @@ from pathlib import Path
 from ..loop.run.run import Run
 from .subject import Subject
 
+_LICENCES = {
+    "osqp": "`osqp/` is OSQP with QDLDL, as its own wheel carries them for generated code, under the Apache License "
+    "2.0 (`osqp/LICENSE`).",
+    "daqp": "`daqp/src` and `daqp/include` are files of DAQP 0.11.0, as they are, under the MIT License "
+    "(`daqp/LICENSE`).",
+}
 _TEXT = Path(__file__).parent / "c" / "readme.md"
 
 
@@ -19,6 +25,8 @@ def readme(subject: Subject, run: Run) -> str:
     watched = ", ".join(subject.kinds) or "none"
     worst = tuning.max_iterations
     n, m, _, of_a, _ = subject.limited[-1].sizes
+    # OSQP solves with its factor, and DAQP looks at all rows and updates a factor of those that are active.
+    each = 4 * (subject.limited[-1].factor + of_a + n + m) if tuning.solver == "osqp" else 2 * of_a + 4 * n**2
     units = "\n".join(f"| {i} | `{name}` | {unit} |" for i, (name, unit) in enumerate(kind.units.items()))
     values = {
         "scene": scene.name,
@@ -34,9 +42,11 @@ def readme(subject: Subject, run: Run) -> str:
         "watched": watched,
         "iterations": f"p50 {summary['qp_iterations']['p50']:g}, max {summary['qp_iterations']['max']:g}",
         "worst": str(worst),
-        "worst_flops": f"{worst * 4 * (subject.limited[-1].factor + of_a + n + m):.2g}",
+        "worst_flops": f"{worst * each:.2g}",
+        "licence": _LICENCES[tuning.solver],
         "numbers": units,
-        "versions": f"casadi {version('casadi')}, osqp {version('osqp')}, Python {platform.python_version()}",
+        "versions": f"casadi {version('casadi')}, {tuning.solver} {version(tuning.solver)}, "
+        f"Python {platform.python_version()}",
     }
     text = _TEXT.read_text(encoding="utf-8")
     for name, value in values.items():

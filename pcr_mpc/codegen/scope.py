@@ -55,7 +55,6 @@ def _choices(scene: Scene, tuning: Tuning) -> list[tuple[str, Any, tuple[Any, ..
     carrying = "none" if scene.payload is None or plant.payload == "ignored" else plant.inertia
     return [
         ("law", tuning.law, ("linear_mpc",), other),
-        ("solver", tuning.solver, ("osqp",), 'take solver = "osqp": its sources come with its wheel'),
         ("fallback", tuning.fallback, ("ladder",), other),
         ("observer that adapts", tuning.observer.adapts if tuning.observer else (), ((),), "leave out observer.adapts"),
         ("learning", tuning.learning, (None,), "leave [learning] out of the tuning"),

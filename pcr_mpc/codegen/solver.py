@@ -63,6 +63,18 @@ class Shape:
         return patterns + 9 * (n + m) + of_p + 3 * of_a + 3 * m + 1
 
 
+def daqp_room(shape: Shape, inputs: int) -> tuple[int, int]:
+    """Memory that ``pcr_qp_setup`` takes for DAQP [doubles], [ints]; it is told no slacks of soft rows."""
+    n, m, *_ = shape.sizes
+    soft = (n - inputs) // 2 if shape.identity else 0
+    rows, most = m - 2 * soft, inputs + soft + 1
+    bounds = 0 if soft else inputs
+    handed = 2 * n + 3 * m + rows + inputs**2 + (rows - bounds) * inputs
+    iterates = 5 * most + most * (most + 1) // 2 + 2 * inputs
+    problem = 3 * rows + (rows - bounds) * (inputs + 1) + inputs * (inputs + 1) // 2 + inputs
+    return handed + iterates + problem + (4 * rows if soft else 0), most + inputs + 3 * rows
+
+
 def rates_shape(horizon: int, n: int) -> Shape:
     """The QP that knows the limits on rates and their changes alone."""
     matrix = constraint_matrix(horizon, n)[: 2 * horizon * n].tocsc()

@@ -16,7 +16,7 @@ from ..loop.parts.assembled import tip_noise
 from ..plant.motion.step_graph import limits as step_limits
 from ..plant.rods.chart import critical_load_table
 from .ctext import array, block, defines, number, structure
-from .solver import Shape
+from .solver import Shape, daqp_room
 from .subject import KIND_BITS, Subject
 
 _LOG_TAUT = -15.0  # see strain.quarter_period
@@ -97,12 +97,12 @@ def config(subject: Subject) -> str:
         "PCR_LIMITED_M": rows,
         "PCR_LIMITED_A": of_a,
         "PCR_LIMITED_ROWS": rows - (columns - horizon * n),
-        "PCR_LIMITED_DOUBLES": max(shape.doubles for shape in subject.limited),
-        "PCR_LIMITED_INTS": max(shape.ints for shape in subject.limited),
+        "PCR_LIMITED_DOUBLES": max(_room(subject, shape)[0] for shape in subject.limited),
+        "PCR_LIMITED_INTS": max(_room(subject, shape)[1] for shape in subject.limited),
         "PCR_LIMITED_LAST": _places(subject)[-1],
         "PCR_RATES_A": subject.rates.matrix.nnz,
-        "PCR_RATES_DOUBLES": subject.rates.doubles,
-        "PCR_RATES_INTS": subject.rates.ints,
+        "PCR_RATES_DOUBLES": _room(subject, subject.rates)[0],
+        "PCR_RATES_INTS": _room(subject, subject.rates)[1],
         "PCR_PLANT_MEMORY": sum(subject.plant.step_model.widths) if subject.plant.step_model else 0,
         "PCR_PLANT_MASSLESS": int(subject.plant.inertia == "none" and subject.plant.weight == "none"),
     }
@@ -208,16 +208,17 @@ def _without_rates(subject: Subject, reference: np.ndarray) -> np.ndarray:
 def _shapes(subject: Subject) -> list[str]:
     orders: dict[int, str] = {}
     texts = []
-    for shape in (subject.rates, *subject.limited):
+    daqp = subject.tuning.solver == "daqp"
+    for shape in () if daqp else (subject.rates, *subject.limited):
         if id(shape) not in orders:
             orders[id(shape)] = f"order_{len(orders)}"
             texts.append("static " + array("unsigned short", orders[id(shape)], shape.order))
     matrix = subject.rates.matrix
     return [
         *texts,
-        f"const pcr_qp_shape pcr_rates_shape = {_shape(subject.rates, orders)};\n",
+        f"const pcr_qp_shape pcr_rates_shape = {_shape(subject, subject.rates, orders)};\n",
         f"const pcr_qp_shape pcr_limited_shapes[{len(subject.limited)}] = {{\n"
-        + ",\n".join(_shape(shape, orders) for shape in subject.limited)
+        + ",\n".join(_shape(subject, shape, orders) for shape in subject.limited)
         + "\n};\n",
         array("int", "pcr_limited_places", np.array(_places(subject)[:-1])),
         array("int", "pcr_rates_starts", matrix.indptr),
@@ -231,7 +232,17 @@ def _places(subject: Subject) -> list[int]:
     return [0, *accumulate(sum(shape.sizes[:2]) for shape in subject.limited)]
 
 
-def _shape(shape: Shape, orders: dict[int, str]) -> str:
+def _room(subject: Subject, shape: Shape) -> tuple[int, int]:
+    """Memory of a solver [doubles], [ints]."""
+    if subject.tuning.solver == "daqp":
+        return daqp_room(shape, subject.tuning.horizon * subject.robot.n_rods)
+    return shape.doubles, shape.ints
+
+
+def _shape(subject: Subject, shape: Shape, orders: dict[int, str]) -> str:
     n, m, of_p, of_a, of_k = shape.sizes
+    if subject.tuning.solver == "daqp":
+        soft = (n - subject.tuning.horizon * subject.robot.n_rods) // 2 if shape.identity else 0
+        return f"{{{n}, {m}, {int(shape.identity)}, {soft}}}"
     numbers = [n, m, int(shape.identity), of_p, of_a, of_k, shape.factor]
     return "{" + ", ".join(map(str, numbers)) + f", {orders[id(shape)]}}}"

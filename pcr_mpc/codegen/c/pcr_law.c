@@ -129,7 +129,7 @@ static int solve_rates(pcr_controller *c, const pcr_pose_limits *limits, const d
             }
         }
     }
-    left = pcr_qp_update(&c->rates, p, NULL, q, l, u);
+    left = pcr_qp_update(&c->rates, p, 0, q, l, u);
     if (left) {
         output->solver = (pcr_qp_status)left;
         reset_rates(c);
@@ -156,6 +156,11 @@ static int solve_rates(pcr_controller *c, const pcr_pose_limits *limits, const d
     }
     check(c);
     const double *found = c->check_out + (PCR_HORIZON + 1) * PCR_STATES;
+    left = pcr_qp_judge(&c->rates, found[0] / rate, rate * found[1]);
+    if (left) {
+        output->solver = (pcr_qp_status)left;
+        return 0;
+    }
     double broken = found[2];
     for (int k = 1; k <= PCR_HORIZON; k++) {
         for (int i = 0; i < limits->count; i++) {

@@ -13,7 +13,6 @@
 #include <stddef.h>
 #include <string.h>
 
-#include "auxil.h"
 #include "pcr_tables.h"
 
 #define TOLERANCE (10.0 * PCR_TOLERANCE)
@@ -51,7 +50,7 @@ static void put_away(pcr_limited *limited)
     const int n = qp->shape->n, m = qp->shape->m;
     double *last = limited->last + pcr_limited_places[limited->kinds];
     state->used = 1;
-    state->rho = qp->settings.rho;
+    state->memory = pcr_qp_memory(qp);
     memcpy(last, qp->solution.x, (size_t)n * sizeof *last);
     memcpy(last + n, qp->solution.y, (size_t)m * sizeof *last);
 }
@@ -85,11 +84,8 @@ static int fetch(pcr_limited *limited, int kinds)
     }
     const pcr_limited_state *state = &limited->kept[kinds];
     if (state->used) {
-        /* The iterates need not be kept: every solution starts from the last one, or, after a failure, from zero. */
         const double *last = limited->last + pcr_limited_places[kinds];
-        memcpy(qp->solution.x, last, (size_t)qp->shape->n * sizeof *last);
-        memcpy(qp->solution.y, last + qp->shape->n, (size_t)qp->shape->m * sizeof *last);
-        osqp_update_rho(&qp->solver, state->rho);
+        pcr_qp_resume(qp, last, last + qp->shape->n, state->solved, state->memory);
     }
     limited->kinds = kinds;
     return 0;
@@ -311,8 +307,8 @@ void pcr_limited_solve(pcr_limited *limited, const double *p, const double *q, c
     int crossed = 0;
     for (int i = 0; i < rows; i++) {
         limited->length[i] = worst(limited->length[i], 1e-12 * longest);
-        limited->l[i] = worst(limited->l[i] / limited->length[i], -OSQP_INFTY);
-        limited->u[i] = -worst(-limited->u[i] / limited->length[i], -OSQP_INFTY);
+        limited->l[i] = worst(limited->l[i] / limited->length[i], -PCR_INFINITY);
+        limited->u[i] = -worst(-limited->u[i] / limited->length[i], -PCR_INFINITY);
         crossed = crossed || !(limited->l[i] <= limited->u[i]);
         for (int j = 0; j < size; j++) {
             a[j][i] /= limited->length[i];
@@ -321,22 +317,15 @@ void pcr_limited_solve(pcr_limited *limited, const double *p, const double *q, c
     for (int j = 0; j < 2 * soft; j++) {
         limited->q[size + j] = limited->penalty;
         limited->l[rows + j] = 0.0;
-        limited->u[rows + j] = j % soft < size && !soft_angles ? 0.0 : OSQP_INFTY;
+        limited->u[rows + j] = j % soft < size && !soft_angles ? 0.0 : PCR_INFINITY;
     }
     if (crossed) {
         answer->left = PCR_LEFT_CROSSED;
         return;
     }
     pcr_qp *qp = &limited->qp;
-    double *entries = qp->a_csc.x; /* where they belong; OSQP copies them onto themselves */
-    for (int j = 0; j < size; j++) {
-        memcpy(entries + j * rows, a[j], (size_t)rows * sizeof *a[j]);
-    }
-    for (int j = 0, e = size * rows; j < 2 * soft; j++) {
-        entries[e++] = j < soft ? 1.0 : -1.0;
-        entries[e++] = 1.0;
-    }
-    answer->left = pcr_qp_update(qp, NULL, entries, limited->q, limited->l, limited->u);
+    pcr_qp_write(qp, a[0], PCR_LIMITED_ROWS, rows);
+    answer->left = pcr_qp_update(qp, NULL, 1, limited->q, limited->l, limited->u);
     if (answer->left) {
         pcr_limited_reset(limited, limited->penalty);
         return;
@@ -349,8 +338,13 @@ void pcr_limited_solve(pcr_limited *limited, const double *p, const double *q, c
     if (answer->left) {
         return;
     }
-    limited->kept[kinds].solved = 1;
     const double *v = qp->solution.x, *y = qp->solution.y;
+    judge(limited, count, v, y, answer);
+    answer->left = pcr_qp_judge(qp, answer->primal_residual, answer->dual_residual);
+    if (answer->left) {
+        return;
+    }
+    limited->kept[kinds].solved = 1;
     for (int i = size - 1; i >= 0; i--) {
         double sum = v[i];
         for (int k = i + 1; k < size; k++) {
@@ -359,5 +353,4 @@ void pcr_limited_solve(pcr_limited *limited, const double *p, const double *q, c
         answer->inputs[i] = sum / limited->factor[i][i];
     }
     explain(limited, limits, dt, v, y, answer);
-    judge(limited, count, v, y, answer);
 }

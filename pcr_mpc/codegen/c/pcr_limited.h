@@ -23,7 +23,7 @@ typedef struct {
    are in pcr_limited.last. */
 typedef struct {
     int used, solved;
-    double rho;
+    double memory;
 } pcr_limited_state;
 
 typedef struct {

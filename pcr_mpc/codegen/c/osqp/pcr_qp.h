@@ -11,6 +11,8 @@
 extern "C" {
 #endif
 
+#define PCR_INFINITY OSQP_INFTY
+
 /* How a QP was left; the order is that of pcr_qp_status in pcr.h. */
 enum {
     PCR_LEFT_SOLVED,
@@ -60,14 +62,25 @@ typedef struct {
 int pcr_qp_setup(pcr_qp *qp, const pcr_qp_shape *shape, const pcr_qp_settings *settings, const int *starts,
                  const int *rows, const double *values, double *doubles, int *ints);
 
-/* Replace the data; NULL for P or A keeps it. Returns 0, or PCR_LEFT_NOT_CONVEX: then set it up anew. */
-int pcr_qp_update(pcr_qp *qp, const double *p, const double *a, const double *q, const double *l, const double *u);
+/* Write A's first `rows` rows without slacks, from columns that lie `stride` apart. */
+void pcr_qp_write(pcr_qp *qp, const double *columns, int stride, int rows);
+
+/* Replace the data; NULL for P keeps it, and `written` says that A was. Returns 0, or PCR_LEFT_NOT_CONVEX: then set it
+   up anew. */
+int pcr_qp_update(pcr_qp *qp, const double *p, int written, const double *q, const double *l, const double *u);
 
 /* Start the next solution from x and multipliers y; NULL for y keeps the last ones. */
 void pcr_qp_warm_start(pcr_qp *qp, const double *x, const double *y);
 
 /* Solve in at most `most` iterations; x and y are in qp->solution if 0 is returned. */
 int pcr_qp_solve(pcr_qp *qp, int most, int *iterations);
+
+/* Accept a solution by its residuals: OSQP has judged itself. */
+int pcr_qp_judge(pcr_qp *qp, double primal, double dual);
+
+/* What a solver remembers besides its solution; and go on from a solution and that. */
+double pcr_qp_memory(const pcr_qp *qp);
+void pcr_qp_resume(pcr_qp *qp, const double *x, const double *y, int solved, double memory);
 
 #ifdef __cplusplus
 }

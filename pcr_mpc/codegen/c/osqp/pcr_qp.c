@@ -285,8 +285,22 @@ int pcr_qp_setup(pcr_qp *qp, const pcr_qp_shape *shape, const pcr_qp_settings *s
     return positive == n ? 0 : PCR_LEFT_NOT_CONVEX;
 }
 
-int pcr_qp_update(pcr_qp *qp, const double *p, const double *a, const double *q, const double *l, const double *u)
+void pcr_qp_write(pcr_qp *qp, const double *columns, int stride, int rows)
 {
+    const int slacks = (qp->shape->m - rows), size = qp->shape->n - slacks;
+    double *entries = qp->a_csc.x; /* where they belong; OSQP copies them onto themselves */
+    for (int j = 0; j < size; j++) {
+        memcpy(entries + j * rows, columns + j * stride, (size_t)rows * sizeof *columns);
+    }
+    for (int j = 0, e = size * rows; j < slacks; j++) {
+        entries[e++] = 2 * j < slacks ? 1.0 : -1.0;
+        entries[e++] = 1.0;
+    }
+}
+
+int pcr_qp_update(pcr_qp *qp, const double *p, int written, const double *q, const double *l, const double *u)
+{
+    const double *a = written ? qp->a_csc.x : NULL;
     if ((p != NULL || a != NULL) && osqp_update_data_mat(&qp->solver, p, NULL, 0, a, NULL, 0)) {
         return PCR_LEFT_NOT_CONVEX;
     }
@@ -323,4 +337,24 @@ int pcr_qp_solve(pcr_qp *qp, int most, int *iterations)
     default:
         return PCR_LEFT_INACCURATE;
     }
+}
+
+int pcr_qp_judge(pcr_qp *qp, double primal, double dual)
+{
+    (void)qp, (void)primal, (void)dual;
+    return 0;
+}
+
+double pcr_qp_memory(const pcr_qp *qp)
+{
+    return qp->settings.rho;
+}
+
+void pcr_qp_resume(pcr_qp *qp, const double *x, const double *y, int solved, double memory)
+{
+    /* The iterates need not be kept: every solution starts from the last one, or, after a failure, from zero. */
+    (void)solved;
+    memcpy(qp->solution.x, x, (size_t)qp->shape->n * sizeof *x);
+    memcpy(qp->solution.y, y, (size_t)qp->shape->m * sizeof *y);
+    osqp_update_rho(&qp->solver, memory);
 }
