@@ -134,7 +134,7 @@ def test_the_worst_leads_to_the_same_rungs(solver, most, tmp_path):
         expected, found = in_python.step(k, measured), in_c.step(k, measured)
         assert (found.plan.fallback, found.plan.iterations) == (expected.plan.fallback, expected.plan.iterations), k
         assert found.u == pytest.approx(expected.u, abs=1e-9), k
-        # Of a plan that is moved on, a limit counts that changes it: by rounding, which the two builds of DAQP differ in.
+        # Of a plan that is moved on, a limit counts that changes it, by rounding too, in which builds of DAQP differ.
         if solver == "osqp" or found.plan.fallback is None:
             assert found.plan.active == expected.plan.active, k
         assert bool(in_c.output.doubts) == bool(expected.events), k

@@ -150,7 +150,9 @@ def foresight_graph(
         ahead = ca.vertcat(ahead[:4], planned)
         by_rate = ca.reshape(models[(4 + n) * (5 + n) : (4 + n) * (5 + 2 * n), 0], 4 + n, n)[:4, :]
         moves = (given.pull < 1) * by_rate / given.dt
-        of_plan = ca.horzcat(*(_behind(of_plan[:, j], due[:, j], changes[:, j], n) for j in range(places.models)))
+        behind = _behind(n, of_plan[:, 0].sparsity())
+        of_plan = ca.horzcat(*(behind(of_plan[:, j], due[:, j], changes[:, j]) for j in range(places.models)))
+    of_plan = ca.densify(of_plan)  # once, for the QP and for the result
     qp: Any = [ca.MX(0, 1)] * 4
     measures = ca.MX.zeros(3)
     if condense is not None:
@@ -199,14 +201,17 @@ def _due(given: Any, horizon: int) -> tuple[Any, Any]:
     return time * ca.horzcat(ends[0], between, ends[1]), ends[0]
 
 
-def _behind(packed: Any, due: Any, change: Any, n: int) -> Any:
-    """Model of a tip whose motors are behind the angles of its state by ``due``, which changes at a rate."""
+def _behind(n: int, sparsity: Any) -> Any:
+    """Graph (model of that sparsity, due (n), change (n)) -> model, dense, of a tip whose motors are behind the angles
+    of its state by ``due``, which changes at a rate."""
+    packed, due, change = ca.SX.sym("model", sparsity), ca.SX.sym("due", n), ca.SX.sym("change", n)
     n_states = 4 + n
     ends = [0, n_states**2, n_states * (n_states + 1), n_states * (n_states + 1 + n), packed.size1()]
     parts: list[Any] = ca.vertsplit(packed, ends)
     a, c, b, e = parts
     by_angle, by_rate = ca.reshape(a, n_states, n_states)[:4, 4:], ca.reshape(b, n_states, n)[:4, :]
-    return ca.vertcat(a, c[:4] - by_angle @ due - by_rate @ change, c[4:], b, e)
+    moved = ca.vertcat(a, c[:4] - by_angle @ due - by_rate @ change, c[4:], b, e)
+    return ca.Function("behind", [packed, due, change], [ca.densify(moved)])
 
 
 def _place(
