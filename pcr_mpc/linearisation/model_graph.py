@@ -11,6 +11,7 @@ from ..buffered import graph_cache
 from ..plant.motion.mass_matrix import mass_calls
 from ..plant.motion.step_graph import StepModel
 from ..plant.rods.method import inlined, warm_calls
+from ..plant.rods.numbers import Kind
 from ..plant.statics.weight import robot_weight
 from .linearise import discretisation
 
@@ -83,25 +84,49 @@ def model_graph(model: StepModel, iterations: int) -> Any:
     constant, dt = ca.MX.sym("mass", 2 + n, 2 + n), ca.MX.sym("dt")
     numbers = kind.unpack(vector)
     record, verdict, force, k, g = force_graph(model, iterations)(ca.vertcat(x[:2], x[4:]), memory, vector)
+    if model.inertia == "none":
+        packed, ratios = _of_point_mass(kind)(force, k, g, f_ext, payload, x, vector, dt)
+        return ca.Function("model", [x, f_ext, payload, memory, vector, constant, dt],
+                           [record, packed, ca.vertcat(verdict, ratios)])  # fmt: skip
     tip = numbers.tip_mass + payload
     slopes = ca.DM.zeros((2 + n) ** 2, 2 + n)
-    if model.inertia == "none":
-        mass = ca.diag(ca.vertcat(tip, tip, ca.DM.zeros(n)))
-    elif model.inertia == "constant":
+    if model.inertia == "constant":
         mass = constant
     else:
         of_rods = vector if model.weight == "exact" else kind.weightless(vector)
         unknowns = ca.reshape(record[: model.method.newton.size1_in(0) * n], -1, n)
         mass, slopes = mass_calls(kind, model.method)(unknowns, x[4:], of_rods)
-    if model.inertia != "none":
-        mass = mass + ca.diag(ca.vertcat(payload, payload, ca.DM.zeros(n)))
+    mass = mass + ca.diag(ca.vertcat(payload, payload, ca.DM.zeros(n)))
     push = force - f_ext - tip * numbers.gravity
-    packed = discretisation(n, point=model.inertia == "none")(k, g, push, x, ca.vertcat(numbers.drag, dt), mass, slopes)
-    stiffness, damping = ca.norm_inf(ca.vec(k)) * dt**2 / numbers.tip_mass, numbers.drag * dt / numbers.tip_mass
+    packed = discretisation(n)(k, g, push, x, ca.vertcat(numbers.drag, dt), mass, slopes)
     return ca.Function(
         "model", [x, f_ext, payload, memory, vector, constant, dt],
-        [record, packed, ca.vertcat(verdict, stiffness, damping**2)],
+        [record, packed, ca.vertcat(verdict, _ratios(k, numbers, dt))],
     )  # fmt: skip
+
+
+@graph_cache(maxsize=16)
+def _of_point_mass(kind: Kind) -> Any:
+    """Graph (F, K, G, f_ext, payload, x, numbers, dt) -> model, and the last two of the verdict: all that a massless
+    rod's model needs from its force on, as one list of instructions."""
+    n = kind.n_rods
+    force, k, g = ca.SX.sym("force", 2), ca.SX.sym("k", 2, 2), ca.SX.sym("g", 2, n)
+    f_ext, payload, x = ca.SX.sym("f_ext", 2), ca.SX.sym("payload"), ca.SX.sym("x", 4 + n)
+    vector, dt = ca.SX.sym("numbers", kind.size), ca.SX.sym("dt")
+    numbers = kind.unpack(vector)
+    tip = numbers.tip_mass + payload
+    mass = ca.diag(ca.vertcat(tip, tip, ca.SX.zeros(n)))
+    push = force - f_ext - tip * numbers.gravity
+    packed = discretisation(n, point=True)(
+        k, g, push, x, ca.vertcat(numbers.drag, dt), mass, ca.SX.zeros((2 + n) ** 2, 2 + n)
+    )
+    return ca.Function("discretise", [force, k, g, f_ext, payload, x, vector, dt], [packed, _ratios(k, numbers, dt)],
+                       {"cse": True})  # fmt: skip
+
+
+def _ratios(k: Any, numbers: Any, dt: Any) -> Any:
+    stiffness, damping = ca.norm_inf(ca.vec(k)) * dt**2 / numbers.tip_mass, numbers.drag * dt / numbers.tip_mass
+    return ca.vertcat(stiffness, damping**2)
 
 
 @graph_cache(maxsize=16)
