@@ -50,7 +50,7 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/fig
 	$(BIN)/python experiments/controllers.py --out results/controllers
 	cp results/fold_guard/*.png results/controllers/*.png docs/figures/
 	$(BIN)/pcr-mpc track models/scenes/lemniscate.toml --out results/lemniscate
-	cp results/lemniscate/track.png results/lemniscate/track.gif docs/figures/
+	cp results/lemniscate/track.png results/lemniscate/track.gif results/lemniscate/replay.html docs/figures/
 	$(BIN)/pcr-mpc timing models/scenes/lemniscate.toml --out results/timing
 	cp results/timing/timing.png docs/figures/
 

@@ -250,6 +250,25 @@ def test_news_is_not_dropped_with_frames():
     assert page.waiting == "frame 4"
 
 
+def test_who_does_not_listen_is_hung_up_on():
+    class Connection:
+        class transport:
+            aborted = False
+
+            @classmethod
+            def abort(cls):
+                cls.aborted = True
+
+    page = Page(Connection())
+    for number in range(150):
+        page.tell(f"news {number}")
+    assert not Connection.transport.aborted
+    for number in range(100):
+        page.tell(f"news {number}")
+    assert Connection.transport.aborted
+    assert len(page.news) < 100
+
+
 def test_only_loopback_unless_it_is_said():
     with pytest.raises(OutputError, match="loopback"):
         ViewServer(lambda: None, ("0.0.0.0", 0), Path())

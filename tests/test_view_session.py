@@ -8,6 +8,7 @@ import pytest
 
 from pcr_mpc import Plant, load_scene
 from pcr_mpc.errors import PCRError
+from pcr_mpc.loop.controller.own_controller import OwnController
 from pcr_mpc.loop.run.run import load_run
 from pcr_mpc.study.identification.log import read_log
 from pcr_mpc.view.session import Session
@@ -31,6 +32,7 @@ def session(played):
         played.choose("lemniscate")
     played.pause(False)
     played.reset()
+    played.events.clear()
     return played
 
 
@@ -239,3 +241,52 @@ def test_what_cannot_be_chosen_leaves_all_as_it_is(session):
     session.advance(0.1)
     assert session.chosen == "lemniscate"
     assert session.decision.plan is not None
+
+
+def test_a_controller_takes_up_a_robot_in_motion(session):
+    """With the tip's velocity it is told, what the rods carry is no load; without, it is taken for one."""
+    session.advance(1.6)
+    x, pose = session.rig.x.copy(), session.rig.equilibrium()
+    assert np.hypot(*x[2:4]) > 0.1  # m/s
+    controller = session.pilot.controller
+    controller.start(pose, velocity=x[2:4])
+    knowing = controller.step(tip=x[:2], angles=x[4:])
+    controller.start(x[:2], x[4:], mode="LR")
+    guessing = controller.step(tip=x[:2], angles=x[4:])
+    assert knowing.estimate[2:4] == pytest.approx(x[2:4])
+    assert np.hypot(*knowing.force) < 1e-9
+    assert guessing.force == pytest.approx(pose.force, rel=1e-3)
+    assert not guessing.estimate[2:4].any()
+    session.choose("lqr")
+    session.advance(0.4)
+    assert "failure" not in kinds(session)
+    assert np.hypot(*(session.rig.x[:2] - session.target())) < 2e-3
+
+
+OWN = """
+import numpy as np
+
+class Mine:
+    name = "mine"
+    def start(self, pose):
+        self.n = len(pose.q)
+    def step(self, k, x):
+        if k == 20:
+            raise RuntimeError("lost my way")
+        return 0.1 * np.ones(self.n)
+"""
+
+
+def test_a_controller_of_ones_own_steers_and_its_failure_leaves_the_robot(scene, tmp_path):
+    (tmp_path / "mine_for_view.py").write_text(OWN)
+    session = Session(scene, OwnController("mine_for_view:Mine", str(tmp_path)))
+    assert session.choice.names[0] == "Mine"
+    q = session.rig.x[4:].copy()
+    session.advance(0.1)
+    assert session.rig.x[4:] == pytest.approx(q + 0.01, abs=1e-9)
+    with pytest.raises(PCRError, match="target"):
+        session.move_target(0.0, 0.2)
+    session.advance(0.2)
+    assert session.chosen == "off"
+    assert any("lost my way" in event["message"] for event in session.events)
+    assert np.isfinite(session.rig.x).all()

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
 _AHEAD = 3  # frames that a page may not have drawn yet
+_UNHEARD = 200  # messages that wait for a page, beyond which nobody is there
 
 
 class Page:
@@ -20,8 +21,10 @@ class Page:
     ----------
     waiting : str or None
         Newest frame that it was not sent.
-    sent, seen : int
-        Numbers of the last frames that it was sent and has drawn.
+    news : list of str
+        What is not to be missed, and was not sent yet.
+    sent : list of int
+        Numbers of the frames that it was sent and has not drawn yet.
     ghosts : bool
         Whether it shows them.
     """
@@ -43,8 +46,11 @@ class Page:
         return dropped
 
     def tell(self, text: str) -> None:
-        """Have something said that is not to be missed."""
+        """Have something said that is not to be missed; who does not listen for long is hung up on."""
         self.news.append(text)
+        if len(self.news) > _UNHEARD:
+            self.news.clear()
+            self.connection.transport.abort()
         self.due.set()
 
     def saw(self, number: int) -> None:
