@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import load_scene
-from pcr_mpc.errors import OutputError
+from pcr_mpc.errors import OutputError, PCRError
 from pcr_mpc.view.commands import LONGEST, MessageError, read
 from pcr_mpc.view.pages import Page
 from pcr_mpc.view.server import ViewServer
@@ -319,3 +319,14 @@ def test_what_takes_a_while_is_told_to_all(served):
         until(socket, lambda frame: frame["controller"] == "lqr")
         ask(socket, do="controller", name="lemniscate")
         until(socket, lambda frame: frame["controller"] == "lemniscate")
+
+
+def test_without_websockets_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "websockets", None)
+    with pytest.raises(PCRError, match=r"pcr_mpc\[view\]"):
+        ViewServer(lambda: None, ("127.0.0.1", 0), Path())
+
+
+def test_an_address_of_ipv6_is_one_that_browsers_take():
+    server = ViewServer(lambda: None, ("::1", 8000), Path())
+    assert server.url.startswith("http://[::1]:8000/?token=")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+import threading
 import webbrowser
 from pathlib import Path
 
@@ -34,8 +36,9 @@ def view(options: argparse.Namespace) -> int:
     def tell(address: str) -> None:
         print(f"{scene.name}: {address}\n{scene.name}: whoever has this address moves the robot; Ctrl-C ends it",
               file=sys.stderr, flush=True)  # fmt: skip
-        if not options.no_browser:
-            webbrowser.open(address)
+        if not options.no_browser and _has_screen():
+            # Aside: some browsers come back only when they are closed.
+            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
 
     print(f"{scene.name}: getting ready", file=sys.stderr, flush=True)
     try:
@@ -45,6 +48,11 @@ def view(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"scene": scene.name, **server.counts}))
     return 0
+
+
+def _has_screen() -> bool:
+    """Whether a browser would have one: those for terminals would take this one over."""
+    return sys.platform in ("win32", "darwin") or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def replay(options: argparse.Namespace) -> int:

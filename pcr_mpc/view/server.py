@@ -90,7 +90,8 @@ class ViewServer:
     @property
     def url(self) -> str:
         """Address of the page, with its token."""
-        return f"http://{self.address[0]}:{self.address[1]}/?token={self.token}"
+        host = f"[{self.address[0]}]" if ":" in self.address[0] else self.address[0]
+        return f"http://{host}:{self.address[1]}/?token={self.token}"
 
     def serve(self, tell: Callable[[str], None], *, until: Callable[[], bool] = lambda: False) -> None:
         """Serve until Ctrl-C, or ``until`` says so; ``tell`` is told the address once the robot moves.
@@ -100,7 +101,7 @@ class ViewServer:
         PCRError, ValueError
             The session could not be made, or failed.
         KeyboardInterrupt
-            On Ctrl-C; nothing is left running.
+            On Ctrl-C.
         """
         # Ghosts, which are asked for, do not wait for the workspace.
         self._behind, self._other = Scenery(), Scenery()
@@ -145,7 +146,7 @@ class ViewServer:
                 finally:
                     ghosts.cancel()
         except OSError as error:
-            where = f"{self.address[0]}:{self.address[1]}"
+            where = "{}:{}".format(*self.address)
             raise OutputError(f"cannot listen on {where}: {error}; give another --port", path=where) from None
         finally:
             self._over = True
@@ -159,8 +160,6 @@ class ViewServer:
     def _raise(self) -> None:
         if self._failure is not None:
             raise self._failure
-
-    # From the session
 
     def _published(self, kind: str, what: Any) -> None:
         if kind == "frame":
@@ -184,10 +183,6 @@ class ViewServer:
             self._failure = what or PCRError("the session has ended")
             self._ready.set()
 
-    def _tell_all(self, text: str) -> None:
-        for each in self._pages:
-            each.tell(text)
-
     def _draw_workspace(self, robot: Robot, pose: Any, mode: str) -> None:
         self._kept.pop("workspace", None)
 
@@ -201,6 +196,10 @@ class ViewServer:
     def _keep(self, kind: str, text: str) -> None:
         self._kept[kind] = text
         self._tell_all(text)
+
+    def _tell_all(self, text: str) -> None:
+        for each in self._pages:
+            each.tell(text)
 
     async def _look_for_ghosts(self) -> None:
         last: np.ndarray | None = None
@@ -222,8 +221,6 @@ class ViewServer:
             text = text_of("ghosts", **found)
             for each in wanting:
                 each.tell(text)
-
-    # From pages
 
     def _requested(self, connection: ServerConnection, request: Request) -> Response | None:
         """Hand out the page, let its socket in, and nobody else."""
