@@ -315,3 +315,23 @@ def test_reset_is_reproducible_bit_for_bit(solver):
     first = sequence()
     solver.reset()
     assert sequence() == first
+
+
+@pytest.mark.parametrize("kind", [DAQPSolver, QPSolver])
+def test_a_reset_of_what_was_not_used_costs_nothing(kind, monkeypatch):
+    """A controller has a solver for each combination of limits, and forgets all of them where a problem jumps."""
+    solver, made = kind(sp.csc_matrix(A), tolerance=1e-7), []
+    set_up = kind._set_up
+    monkeypatch.setattr(kind, "_set_up", lambda self: [made.append(self), set_up(self)])
+    solver.reset()
+    assert not made
+    uses = [
+        lambda: solver.update(**data()[0]),
+        lambda: solver.warm_start(np.zeros(N), np.ones(M)),
+        lambda: solver.answer(tuple(data()[0].values()), None, np.empty(N), np.empty(M), sound=True),
+    ]
+    for count, use in enumerate(uses, 1):
+        use()
+        solver.reset()
+        solver.reset()
+        assert len(made) == count

@@ -62,13 +62,20 @@ class CheckedQP(ABC):
         self._matrix = A
         self._entries = A.indices * n + np.repeat(np.arange(n), np.diff(A.indptr))  # of the dense one, row by row
         self._data: tuple[np.ndarray | None, np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._fresh = False
         self.reset()
 
     def reset(self) -> None:
-        """Start afresh, with the first A, so that the same calls give the same results bit for bit."""
+        """Start afresh, with the first A, so that the same calls give the same results bit for bit.
+
+        One that has not been used since costs nothing: to set up takes a millisecond, and a controller has many.
+        """
+        if self._fresh:
+            return
         self._dense_a = np.ascontiguousarray(self._matrix.toarray())
         self._data = None
         self._set_up()
+        self._fresh = True
 
     @abstractmethod
     def _set_up(self) -> None:
@@ -126,6 +133,7 @@ class CheckedQP(ABC):
             As `update` and `solve`.
         """
         if sound:
+            self._fresh = False
             self._hand_over(*problem, None)
             self._data = problem
         else:
@@ -162,6 +170,7 @@ class CheckedQP(ABC):
     def warm_start(self, x: np.ndarray, y: np.ndarray | None = None) -> None:
         """Start the next solve from x, shape (n,), and multipliers y, shape (m,); None keeps the last ones."""
         y = None if y is None else _checked("y", y, self.m)
+        self._fresh = False
         self._start_from(_checked("x", x, self.n), y)
 
     def update(
@@ -206,6 +215,7 @@ class CheckedQP(ABC):
                 status="crossed bounds",
                 limit=row,
             )
+        self._fresh = False
         if A is not None:
             A = _checked("A", A, self._matrix.nnz)
             self._dense_a.ravel()[self._entries] = A
