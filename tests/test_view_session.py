@@ -1,5 +1,6 @@
 """A session of the view without a network: hands, targets, time, settings, records."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,9 +8,10 @@ import numpy as np
 import pytest
 
 from pcr_mpc import Plant, load_scene
-from pcr_mpc.errors import PCRError
+from pcr_mpc.errors import PCRError, UnstableError
 from pcr_mpc.loop.controller.own_controller import OwnController
 from pcr_mpc.loop.run.run import load_run
+from pcr_mpc.plant.statics.free_tip import forward_statics
 from pcr_mpc.study.identification.log import read_log
 from pcr_mpc.view.session import Session
 from tests.view_check import spring_balance
@@ -31,6 +33,9 @@ def session(played):
     if played.chosen != "lemniscate":
         played.choose("lemniscate")
     played.pause(False)
+    played.release()
+    if played.mode != "LR":
+        played.switch_mode("LR")
     played.reset()
     played.events.clear()
     return played
@@ -164,6 +169,51 @@ def test_a_snap_is_told_with_the_energy_that_it_lost(session):
     assert before - energy == pytest.approx(snaps[0]["energy"], abs=0.01)
     assert snaps[0]["p"] == pytest.approx(session.rig.x[:2], abs=5e-3)
     session.switch_mode("LR")
+
+
+def test_a_tip_that_snaps_where_its_pose_ends_is_told_with_what_it_loses(session):
+    """Each rod keeps its shape; the free tip's own stiffness passes zero. Energies against the statics."""
+    session.choose("off")
+    session.switch_mode("LL")
+    angle, snaps, rest, fold = session.rig.x[5], [], session.start_pose, None
+    while not snaps and angle < 1.0:
+        angle += 0.012
+        session.drag_motor(1, angle)
+        session.advance(0.02)
+        snaps = [event for event in session.events if event["kind"] == "snap"]
+        if fold is None:
+            try:
+                rest = forward_statics(session.scene.robot, session.rig.x[4:], guess=rest)
+            except UnstableError:
+                fold = session.rig.x[5]  # where the branch of the free tip ends
+    assert 0.0 <= session.rig.x[5] - fold < 0.15  # rad: it takes the tip a moment to fall
+    assert "fold" in snaps[0]["message"]
+    session.drag(*landing(snaps[0]))  # a hand catches it, and lets it down there
+    session.advance(2.0)
+    after = forward_statics(session.scene.robot, session.rig.x[4:], guess=session.rig.equilibrium())
+    # While the tip begins to fall the motor turns on, and works.
+    torque = max(abs(rest.motor_torque[1]), abs(after.motor_torque[1]))
+    worked = torque * (session.rig.x[5] - rest.q[1])
+    assert snaps[0]["energy"] == pytest.approx(rest.energy - after.energy, abs=worked)
+    assert worked < 0.4 * snaps[0]["energy"]
+    assert snaps[0]["energy"] > 0.05  # J
+    session.release()
+    session.switch_mode("LR")
+
+
+def landing(snap):
+    """Where a snap leads [m], as it says."""
+    x, y = re.search(r"at \((-?\d+), (-?\d+)\) mm", snap["message"]).groups()
+    return float(x) / 1e3, float(y) / 1e3
+
+
+def test_a_swing_is_no_snap(session):
+    session.choose("off")
+    session.drag(0.08, 0.18)
+    session.advance(0.6)
+    session.release()
+    session.advance(2.0)
+    assert "snap" not in kinds(session)
 
 
 def test_settings_change_the_robot_and_leave_it_where_it_is(session):

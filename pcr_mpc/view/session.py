@@ -14,6 +14,7 @@ from ..loop.controller.own_controller import OwnController
 from ..loop.parts.controllers import Decision
 from ..loop.scene.scene import Scene
 from ..plant.statics.equilibrium import Equilibrium
+from .falls import Falls
 from .journal import Journal
 from .pilot import OFF, Choice, Pilot
 from .recorder import Recorder
@@ -46,7 +47,7 @@ class Session(Journal):
     settings : Settings
     paused : bool
     speed : float
-        Of its time over real time that is asked for.
+        Of its time over real time, as asked for.
     decision : Decision or None
         The last.
     mode, mode_now : str
@@ -71,7 +72,7 @@ class Session(Journal):
         """Stand at the start, at time zero."""
         self.t, self._j = 0.0, 0
         self.decision: Decision | None = None
-        self._lost_at, self._decided = -math.inf, 0.0
+        self._lost_at, self._decided, self._falls = -math.inf, 0.0, Falls()
         self.rig = Rig(self.scene, self.start_pose, np.array(self._told.start_velocity), self._seed)
         self._kept: deque[Equilibrium] = deque([self.start_pose], maxlen=_BACK)
         self.mode_now = self.mode
@@ -127,6 +128,8 @@ class Session(Journal):
         self._decided = self.t
         rig, pilot = self.rig, self.pilot
         rig.carry(self._payload())
+        if fall := self._falls.look(rig):
+            self.tell(**fall)
         measured = rig.measure(pilot.period)
         if rig.hand is not None:
             self.decision = Decision(np.zeros(len(measured) - 4))
@@ -163,10 +166,10 @@ class Session(Journal):
         self.record(False)
         back = self.start_pose if again else self._kept[0]
         self.rig.put(back)
+        self._falls = Falls()
         self._kept = deque([back], maxlen=_BACK)
         self._j, self.paused = 0, self.paused or again
-        where = "at the start, and time stands" if again else "to rest where it was a moment ago"
-        self.tell("recovered", f"the robot was put {where}")
+        self.tell("recovered", f"the robot was put {'at the start, time stands' if again else 'to rest a moment back'}")
         self._take_up(back, follow=False)
 
     def _take_up(self, pose: Equilibrium, *, follow: bool) -> None:
@@ -199,8 +202,7 @@ class Session(Journal):
         PCRError, ValueError
             There is none of that name, or it does not fit; the old one goes on.
         """
-        following = self.pilot.following or not self.pilot.steers
-        self._replace(self.settings, name, follow=following and name != OFF)
+        self._replace(self.settings, name, follow=name != OFF and (self.pilot.following or not self.pilot.steers))
         self.tell("controller", f"controller {self.pilot.name}")
 
     def _replace(self, settings: Settings, name: str, *, follow: bool) -> None:
@@ -223,7 +225,7 @@ class Session(Journal):
         self.pilot.send(checked_vector("target", (x, y), 2))
 
     def follow(self) -> None:
-        """Let the target go along the scene's path, from its beginning; what cannot be had is told."""
+        """Let the target go along the scene's path, from its beginning."""
         self.pilot.follow()
 
     def stop(self) -> None:
@@ -277,7 +279,7 @@ class Session(Journal):
         self.reset()
 
     def set(self, name: str, value: float) -> None:
-        """Turn a setting (see `Settings`); errors as `Settings.turned`, and those of a controller that is told."""
+        """Turn one of the settings; errors as `Settings.turned`, and those of a controller that is told."""
         settings = self.settings.turned(name, value, self.dials)
         dial = self.dials[name]
         if dial.told:

@@ -74,7 +74,7 @@ class Layers {
       c.beginPath(); c.arc(x, y, 14 + 110 * share, 0, 2 * Math.PI); c.stroke();
       c.font = "700 16px system-ui, sans-serif";
       c.textAlign = "center";
-      c.fillText(`snap: ${(1000 * each.energy).toFixed(0)} mJ lost`, Math.min(Math.max(x, 90), this.element.clientWidth - 90), Math.max(30, y - 28 - 30 * share));
+      c.fillText(each.energy === undefined ? "snap" : `snap: ${(1000 * each.energy).toFixed(0)} mJ lost`, Math.min(Math.max(x, 90), this.element.clientWidth - 90), Math.max(30, y - 28 - 30 * share));
       c.restore();
     }
   }

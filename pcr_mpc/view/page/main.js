@@ -98,7 +98,7 @@
     }
     const fresh = frame;
     for (const event of panel.takeEvents(fresh.events || [])) {
-      if (event.kind === "snap" && event.p) canvas.flash(event, now / 1000);
+      if (event.p) canvas.flash(event, now / 1000);
       if (["refused", "failure", "recovered"].includes(event.kind)) panel.banner(event.message);
     }
     if (canvas.workspace && fresh.start && canvas.workspace.mode !== fresh.start) { canvas.setWorkspace({}); drawLegend(); }
