@@ -239,25 +239,54 @@ class Foresight:
 
     def _bring_along(self) -> None:
         """Take the ladder for the rods that have not followed, one place after the other."""
-        good, found = self._outputs["good"], self._outputs
-        payloads, force = self.inputs["payloads"].ravel(), found["corrected"][-2:]
-        for j in range(self.places.count):
-            if good[j] < 1.0:
-                self._plant.recall(self._records[j])
-                x = found["places"].reshape(-1, self.places.count, order="F")[:, j].copy()
-                self._plant.carry(float(payloads[j]), x)
-                linearise(self._plant, x, np.zeros(len(x) - 4), self._period, force)
-                self._records[j] = self._plant.record
-                # What comes after stands on this place.
-                self._graph()
+        good, late = self._outputs["good"], dict[int, np.ndarray]()
+        try:
+            for j in range(self.places.count):
                 if good[j] < 1.0:
-                    raise ConvergenceError(
-                        f"no linear model at p = {x[:2]} m, q = {x[4:]} rad, {j} periods ahead: the rods get there, "
-                        "and do not stay; keep away from this pose",
-                        residual=float("nan"), iterations=0, last=x,
-                    )  # fmt: skip
+                    before = self._records[j].copy()
+                    self._climb(j)
+                    late[j] = before
+                    if j < self.places.delay:
+                        self._look_again(late)  # the next place stands on this one
+        finally:
+            self._look_again(late)
         if good[-1] < 1.0:
             self._follow_target()
+
+    def _climb(self, j: int) -> None:
+        """Take the rods of place j along by the ladder."""
+        x = self._place(j)
+        self._plant.recall(self._records[j])
+        self._plant.carry(float(self.inputs["payloads"].ravel()[j]), x)
+        linearise(self._plant, x, np.zeros(len(x) - 4), self._period, self.corrected[-2:])
+        self._records[j] = self._plant.record
+
+    def _look_again(self, late: dict[int, np.ndarray]) -> None:
+        """Evaluate with the records of places that have climbed, and raise for the first whose rods do not stay.
+
+        ``late`` are their records before that, which those after it get back; it is emptied.
+        """
+        if not late:
+            return
+        self._graph()
+        places = list(late)
+        for j in places:
+            if self._outputs["good"][j] < 1.0:
+                for later in places[places.index(j) + 1 :]:
+                    self._records[later] = late[later]
+                late.clear()
+                x = self._place(j)
+                raise ConvergenceError(
+                    f"no linear model at p = {x[:2]} m, q = {x[4:]} rad, {j} periods ahead: the rods get there, "
+                    "and do not stay; keep away from this pose",
+                    residual=float("nan"), iterations=0, last=x,
+                )  # fmt: skip
+        late.clear()
+
+    def _place(self, j: int) -> np.ndarray:
+        """State at place j."""
+        places = self._outputs["places"].reshape(-1, self.places.count, order="F")
+        return np.array(places[:, j])
 
     def _follow_target(self) -> None:
         """Take the ladder for the rods of the motor target; where it leads nowhere, they stay where they are."""
