@@ -240,7 +240,7 @@ def test_the_rods_push_the_tip_by_the_slope_of_their_kinetic_energy(pair, centre
         w = np.concatenate([v, rates])
         return w @ plant.mass(p, centre.q)[0] @ w / 2
 
-    momentum, push, _ = _momentum(plant, np.zeros(1), centre.p[None], v[None], centre.q[None], rates[None])
+    momentum, push, *_ = _momentum(plant, np.zeros(1), centre.p[None], v[None], centre.q[None], rates[None])
     by_p, by_v = np.empty(2), np.empty(2)
     for axis, h in enumerate(1e-5 * np.eye(2)):
         by_p[axis] = (energy(centre.p + h, v) - energy(centre.p - h, v)) / 2e-5
