@@ -160,7 +160,6 @@ def test_what_a_solver_refuses_is_not_passed_over():
     qp = QPSolver(constraint_matrix(2, 2), 1e-5, 100)
     with pytest.raises(RuntimeError, match="OSQP refused warm_start with code 3; the old data are still in place"):
         qp._refused("warm_start", 3)
-    qp._require(0, "warm_start")
     with pytest.raises(
         RuntimeError, match="DAQP refused update with code -3; the data are lost, call update with good"
     ):
