@@ -175,6 +175,7 @@ def test_release_needs_the_condensed_mass(release, choice):
     assert 2e-10 < choice.step_error < 2e-8
 
 
+@pytest.mark.slow
 def test_estimates_are_of_the_right_size():
     """By a factor of 1.5 too small to 3 too large, against what the neighbouring rungs differ by over the motion."""
     expected = {  # mm; docs/figures/rungs.csv

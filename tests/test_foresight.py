@@ -149,7 +149,7 @@ def test_without_an_observer_nothing_is_carried(pair, centre):
     assert foresight().shift.tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("tuning", ["default", "frozen", "pd"])
+@pytest.mark.parametrize("tuning", ["default", pytest.param("frozen", marks=pytest.mark.slow), "pd"])
 def test_machine_code_gives_the_same_bits(tuning, compiler, machine_code):
     scene = replace(load_scene(SCENES / "lemniscate.toml"), duration=0.3, delay=1)
     known = load_tuning(CONTROLLERS / f"{tuning}.toml")

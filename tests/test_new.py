@@ -82,8 +82,11 @@ def test_strips_of_spring_steel(tmp_path):
         (["--width", "1e-2", "--thickness", "4e-4", "--diameter", "1e-3"], "give one"),
         (["--width", "0.05", "--thickness", "0.02"], "at least 50 times as long, 1 m"),
         (["--width", "nan", "--thickness", "4e-4"], "width"),
-        (["--width", "12e-3", "--thickness", "1.4e-3", "--material", "spring_steel", "--length", "0.42"],
-         "nearest that works: 1.3 mm thickness"),
+        pytest.param(
+            ["--width", "12e-3", "--thickness", "1.4e-3", "--material", "spring_steel", "--length", "0.42"],
+            "nearest that works: 1.3 mm thickness",
+            marks=pytest.mark.slow,
+        ),
     ],
 )  # fmt: skip
 def test_strips_that_are_none(tmp_path, capsys, words, problem):
