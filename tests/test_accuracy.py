@@ -40,7 +40,9 @@ def sweep(pair, count, seed):
 
 
 @pytest.mark.parametrize(
-    ("count", "seed"), [(1000, 11), pytest.param(10_000, 12, marks=pytest.mark.slow)], ids=["1000", "10000"]
+    ("count", "seed"),
+    [(1000, 11), pytest.param(10_000, 12, marks=[pytest.mark.slow, pytest.mark.longest])],
+    ids=["1000", "10000"],
 )
 def test_against_taylor_series(pair, count, seed):
     equilibria = sweep(pair, count, seed)
