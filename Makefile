@@ -53,6 +53,16 @@ figures: $(READY)  ## the paper's figures and the README's pictures, in docs/fig
 	cp results/lemniscate/track.png results/lemniscate/track.gif results/lemniscate/replay.html docs/figures/
 	$(BIN)/pcr-mpc timing models/scenes/lemniscate.toml --out results/timing
 	cp results/timing/timing.png docs/figures/
+	$(BIN)/python experiments/loop_stability.py --out results/loop_stability
+	cp results/loop_stability/delay_stiffness.png docs/figures/loop_stability.png
+	cp results/loop_stability/delay_period.png docs/figures/loop_stability_period.png
+	cp results/loop_stability/lag_horizon.png docs/figures/loop_stability_lag.png
+	$(BIN)/python experiments/learning.py --out results/learning
+	cp results/learning/learning.png docs/figures/
+	$(BIN)/pcr-mpc plan eight_points --out results/plan/eight_points.csv
+	cp results/plan/eight_points.png docs/figures/planning.png
+	$(MAKE) test-browser
+	cp results/browser/drag.png docs/figures/view.png
 
 charts: $(READY)  ## speed against accuracy: three charts, their CSVs and the ratios, in docs/figures/; wants an idle machine
 	$(BIN)/python -m experiments.accuracy_vs_speed --out results/charts

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from .. import interrupt
 from ..errors import IdentificationError, PCRError, checked_integer, checked_number
 from ..frozen import Frozen
+from ..loop.demand.feasibility import reference_of
 from ..loop.demand.feed_forward import InverseDynamics, feed_forward
 from ..loop.demand.slowing import Slowed
 from ..loop.references.trajectory import Lemniscate, Trajectory, smooth_step
@@ -279,7 +280,7 @@ def _as_large_as_fits(scene: Scene, candidate: MultiSine, size: float) -> MultiS
 def _fits(scene: Scene, trajectory: MultiSine) -> bool:
     asked = replace(scene, trajectory=trajectory)
     try:
-        reference = feed_forward(asked, scene.robot, scene.start(), 0)
+        reference = reference_of(asked, scene.start())
     except PCRError:
         return False
     return max(_use(asked, reference).values()) <= 1.0

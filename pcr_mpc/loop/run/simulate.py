@@ -17,8 +17,8 @@ from ...control.tuning import Tuning
 from ...errors import PCRError, SimulationError, checked_array, checked_integer
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
-from ..demand.feasibility import demand_line, reference_demand, reference_excess
-from ..demand.feed_forward import InverseDynamics, feed_forward
+from ..demand.feasibility import demand_line, reference_demand, reference_excess, reference_of
+from ..demand.feed_forward import InverseDynamics
 from ..hardware.camera import IDEAL, Pictures
 from ..parts.controllers import Controller, decision_of, name_of
 from ..scene.scene import Scene
@@ -259,7 +259,7 @@ def _foreseen(
     if dynamics is None:
         robot = scene.robot
         try:
-            dynamics = feed_forward(scene, robot, pose, 0)
+            dynamics = reference_of(scene, pose)
         except PCRError as error:
             return None, [str(error)]
     asked = reference_demand(scene, dynamics)
