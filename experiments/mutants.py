@@ -7,7 +7,7 @@ mutant has had its minute. Every place in the code that could be changed is as l
 Survivors are printed with their diffs, and written to survivors.diff beside mutants.sqlite, which Cosmic Ray's own
 reports read (``cr-report``, ``cr-html``).
 
-Run as ``make mutants`` or ``python -m experiments.mutants --count 20 --tests tests/test_mpc.py``; 200 take some hours.
+Run as ``make mutants`` or ``python -m experiments.mutants --count 20 --tests tests/control``; 200 take some hours.
 ``--resume`` goes on where an earlier run into the same folder was stopped, and raises its number if asked for more.
 """
 

@@ -59,7 +59,7 @@ def make_poses(robot: Robot, count: int) -> list[Pose]:
 
 
 def reference(robot: Robot, equilibria: list[Equilibrium]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """F, K and G of each equilibrium by Taylor series in extended precision (see ``tests/taylor_rod.py``)."""
+    """F, K and G of each equilibrium by Taylor series in extended precision (see ``tests/rods/taylor_rod.py``)."""
     newton, _ = elastica.rod_newton()
     n, count = robot.n_rods, len(equilibria)
     starts, poses = np.empty((3, n, count)), np.empty((3, n, count))

@@ -8,7 +8,7 @@ import pytest
 
 from pcr_mpc import load_scene, shipped
 from tests.browser.conftest import SHOTS, wait
-from tests.view_check import spring_balance
+from tests.view.view_check import spring_balance
 
 
 @pytest.fixture(scope="module")

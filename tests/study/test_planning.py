@@ -1,0 +1,342 @@
+"""Plans are as fast as closed forms and toppra say, keep their limits between their points too, and can be tracked."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcr_mpc import (
+    ConvergenceError,
+    InfeasibleError,
+    Line,
+    ModelError,
+    PlanLimits,
+    Spline,
+    UnreachableError,
+    UnstableError,
+    inverse_statics,
+    load_path,
+    load_scene,
+    make_controller,
+    plan_timing,
+    simulate,
+)
+from pcr_mpc.cli import main
+from pcr_mpc.linearisation.pose_limits import PoseLimits
+from pcr_mpc.loop.references.trajectory import PickAndPlace, smooth_step
+from pcr_mpc.report.planning import plan_table
+from pcr_mpc.study.planning.course import paced
+from pcr_mpc.study.planning.fastest import Problem, evaluated
+from pcr_mpc.study.planning.free import way_points
+from pcr_mpc.study.planning.meshing import points
+from pcr_mpc.study.planning.motion import Carrier
+from pcr_mpc.study.planning.pace import constant_pace, spline_of
+from pcr_mpc.study.planning.path import path_of
+from tests.conftest import MODELS
+
+NO_MOTORS = {"rate": 1e6, "acceleration": 1e12, "torque": 1e3}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return load_scene(MODELS / "scenes" / "pick_and_place.toml")
+
+
+@pytest.fixture(scope="module")
+def points_scene():
+    return load_scene(MODELS / "scenes" / "eight_points.toml")
+
+
+@pytest.fixture(scope="module")
+def planned(points_scene):
+    return plan_timing(points_scene, cells=80)
+
+
+@pytest.fixture(scope="module")
+def light(scene):
+    """The same robot with a tip of no weight: its motors stand as they do at rest, whatever the motion."""
+    return replace(scene, robot=replace(scene.robot, tip_mass=1e-9, drag=0.0))
+
+
+def motors(robot, trajectory, t, pose):
+    """Angles at equally spaced times, by inverse statics of the forces that the motion takes."""
+    samples = trajectory(t)
+    forces = -robot.tip_mass * samples[:, 2] - robot.drag * samples[:, 1]
+    found = []
+    for p, force in zip(samples[:, 0], forces, strict=True):
+        pose = inverse_statics(robot, p, force, guess=pose)
+        found.append(pose)
+    return found
+
+
+def test_limits_are_kept_at_ten_times_the_grid(points_scene, planned):
+    """Angles found one by one, rates and their change by differences of the angles alone."""
+    assert planned.excess <= 1e-3
+    scene, robot = points_scene, points_scene.robot
+    t = np.linspace(0.0, planned.duration, 10 * planned.grid + 1)
+    step = t[1]
+    poses = motors(robot, planned, t, scene.start())
+    q = np.stack([eq.q for eq in poses])
+    rates = np.diff(q, axis=0) / step
+    changes = np.diff(rates, axis=0, prepend=0.0, append=0.0) / step
+    assert np.abs(rates).max() == pytest.approx(robot.rate_limit, rel=1e-3)
+    assert np.abs(rates).max() <= 1.001 * robot.rate_limit
+    assert np.abs(changes).max() <= 1.001 * robot.acceleration_limit
+    assert np.abs(changes).max() >= 0.99 * robot.acceleration_limit
+    assert max(np.abs(eq.motor_torque).max() for eq in poses) <= scene.torque_limit
+    assert all(eq.stable for eq in poses)
+
+
+def test_the_motion_is_one_and_rests_at_both_ends(planned):
+    step = planned.duration / 20000
+    t = np.arange(-3, 20004) * step
+    samples = planned(t)
+    velocity = (samples[2:, 0] - samples[:-2, 0]) / (2 * step)
+    acceleration = (samples[2:, 1] - samples[:-2, 1]) / (2 * step)
+    assert np.abs(velocity - samples[1:-1, 1]).max() < 1e-6
+    assert np.abs(acceleration - samples[1:-1, 2]).max() < 1e-4
+    assert np.abs(np.diff(samples[:, 2], axis=0)).max() < 0.05  # 200 m/s^3 at most: no jump
+    assert np.abs(planned(np.array([0.0, planned.duration]))[:, 1:]).max() < 1e-9
+    assert planned(np.array([0.0]))[0, 0] == pytest.approx([-0.06, 0.22], abs=1e-12)
+    assert planned(np.array([planned.duration]))[0, 0] == pytest.approx([-0.05, 0.24], abs=1e-12)
+
+
+def test_the_path_is_the_scenes(points_scene, planned):
+    given = points_scene.trajectory(np.linspace(0.0, points_scene.trajectory.duration, 20001))[:, 0]
+    away = [np.linalg.norm(given - p, axis=1).min() for p in planned(np.linspace(0.0, planned.duration, 50))[:, 0]]
+    assert max(away) < planned.deviation + 1e-5
+    assert planned.deviation <= 5e-5
+
+
+def test_the_mpc_tracks_it_from_its_file(points_scene, planned, tmp_path):
+    scene = points_scene
+    path = tmp_path / "path.csv"
+    path.write_text(planned.csv())
+    trajectory = load_path(path)
+    assert trajectory.duration == pytest.approx(planned.duration)
+    t = np.linspace(0.0, planned.duration, 3001)
+    assert np.abs(trajectory(t) - planned(t)).max(axis=(0, 2)) == pytest.approx([0.0, 0.0, 0.0], abs=1e-4)
+    duration = scene.period * math.ceil((planned.duration + 0.2) / scene.period)
+    run = simulate(tracked := replace(scene, trajectory=trajectory, duration=duration), tracked.make_plant(),
+                   make_controller(tracked))  # fmt: skip
+    summary = run.summary()
+    assert summary["max_mm"] < 0.05
+    assert not summary["limit_violations"]
+
+
+class Quintic:
+    """A path by the quintic timing of `PickAndPlace`."""
+
+    def __init__(self, path, move):
+        self.path, self.move = path, move
+
+    def __call__(self, t):
+        value, slope, curvature = smooth_step(t / self.move)
+        rate, change = self.path.length * slope / self.move, self.path.length * curvature / self.move**2
+        p, p1, p2 = self.path.derivatives(self.path.length * value)[:3]
+        return np.stack([p, p1 * rate[:, None], p2 * rate[:, None] ** 2 + p1 * change[:, None]], axis=1)
+
+
+def test_it_is_faster_than_a_quintic_within_the_same_limits(points_scene, planned):
+    """Which is slowed down until it keeps them."""
+    robot, pose = points_scene.robot, points_scene.start()
+
+    def share(move):
+        trajectory = Quintic(planned.course.path, move)
+        t = np.linspace(0.0, move, 301)
+        q = np.stack([eq.q for eq in motors(robot, trajectory, t, pose)])
+        rates = np.diff(q, axis=0) / t[1]
+        changes = np.diff(rates, axis=0, prepend=0.0, append=0.0) / t[1]
+        return max(np.abs(rates).max() / robot.rate_limit, np.abs(changes).max() / robot.acceleration_limit)
+
+    fast, slow = 1.0, 3.0
+    while slow - fast > 0.02:
+        middle = (fast + slow) / 2
+        fast, slow = (middle, slow) if share(middle) > 1.0 else (fast, middle)
+    assert fast > 1.5 * planned.duration
+
+
+@pytest.mark.parametrize(("speed", "acceleration"), [(math.inf, 2.0), (0.3, 2.0)])
+def test_a_straight_line_takes_the_time_of_bang_bang(light, speed, acceleration):
+    length = 0.12
+    scene = replace(light, trajectory=Line(points=((-0.06, 0.22), (0.06, 0.22)), speed=0.1))
+    limits = PlanLimits(**NO_MOTORS, tip_speed=speed, tip_acceleration=acceleration)
+    planned = plan_timing(scene, limits=limits, cells=160)
+    top = min(speed, math.sqrt(length * acceleration))
+    best = length / top + top / acceleration
+    assert best <= planned.duration * 1.001
+    assert planned.duration <= 1.02 * best
+    assert np.linalg.norm(planned(np.linspace(0, planned.duration, 5000))[:, 2], axis=1).max() <= 1.001 * acceleration
+
+
+def test_jerk_is_limited_by_option(light):
+    """By the closed form: a quarter of the time each of +J, -J, -J, +J."""
+    scene = replace(light, trajectory=Line(points=((-0.06, 0.22), (0.06, 0.22)), speed=0.1))
+    planned = plan_timing(scene, limits=PlanLimits(**NO_MOTORS, tip_jerk=50.0))
+    best = (32 * 0.12 / 50.0) ** (1 / 3)
+    assert best <= planned.duration * 1.001
+    assert planned.duration <= 1.02 * best
+
+
+@pytest.mark.slow
+def test_it_is_as_fast_as_toppra_where_only_rates_and_accelerations_count(light):
+    toppra = pytest.importorskip("toppra")
+    toppra.setup_logging("ERROR")
+    scene = light
+    robot, limits = scene.robot, PlanLimits(rate=6.0, acceleration=60.0, torque=1e3)
+    planned = plan_timing(scene, limits=limits, cells=160)
+    # Their path: angles at rest, by inverse statics along ours.
+    pose, q = scene.start(), []
+    s = np.linspace(0.0, planned.course.path.length, 301)
+    for p in planned.course.path.derivatives(s)[0]:
+        pose = inverse_statics(robot, p, guess=pose)
+        q.append(pose.q)
+    path = toppra.SplineInterpolator(s, np.array(q))
+    both = np.array([[-1.0, 1.0]] * 2)
+    constraints = [
+        toppra.constraint.JointVelocityConstraint(limits.rate * both),
+        toppra.constraint.JointAccelerationConstraint(
+            limits.acceleration * both, discretization_scheme=toppra.constraint.DiscretizationType.Interpolation
+        ),
+    ]
+    grid = np.linspace(0.0, s[-1], 1001)
+    theirs = toppra.algorithm.TOPPRA(constraints, path, gridpoints=grid, parametrizer="ParametrizeConstAccel")
+    duration = theirs.compute_trajectory().duration
+    assert planned.duration <= 1.02 * duration
+    assert planned.duration >= 0.99 * duration
+    assert planned.excess <= 1e-3
+
+
+def test_slopes_are_those_of_differences(scene, pair):
+    """Of every limit's share, by the coefficients of the pace."""
+    rng = np.random.default_rng(0)
+    path = path_of(scene.trajectory, 0.8, 5e-5)
+    limits = replace(PlanLimits.of_scene(scene), tip_speed=1.0, tip_acceleration=5.0, tip_jerk=200.0)
+    limits = replace(limits, stiffness=50.0, rod_margin=0.38)  # so near that their slopes are computed
+    problem = Problem(paced(path), scene.start(), Carrier(pair.tip_mass, pair.drag, np.zeros(2)), limits)
+    x, c = points(20, 6), constant_pace(20, 0.6).c
+    c = c * (1.0 + 0.2 * np.sin(np.arange(len(c))))
+    q = np.stack([inverse_statics(pair, p, guess=problem.pose).q for p in problem.course(x)[0]])
+    start = evaluated(problem, spline_of(c), x, q, tolerance=1e-9)
+    change = 1e-5 * c * rng.standard_normal(len(c))
+    ends = [evaluated(problem, spline_of(c + sign * change), x, start.turned.q.value, start.turned.poses, 1e-9)
+            for sign in (1.0, -1.0)]  # fmt: skip
+    unknowns = np.stack([spline_of(change)(x, nu=order) for order in range(4)])
+    for here, ahead, behind in zip(start.uses, *(end.uses for end in ends), strict=True):
+        predicted = np.einsum("mkd,dm->mk", here.share.slope, unknowns)
+        found = (ahead.share.value - behind.share.value) / 2
+        allowed = {"change of rate": 5e-2, "motor rate": 5e-3}.get(here.limit, 1e-3)
+        assert np.abs(predicted - found).max() < allowed * np.abs(found).max(), here.limit
+    assert {use.limit for use in start.uses} >= {"stiffness", "rod margin", "tip jerk", "motor torque"}
+
+
+def test_a_closed_path_is_not_free():
+    closed = Spline(((0.0, 0.25), (0.03, 0.26), (0.0, 0.28)), 0.1, closed=True)
+    with pytest.raises(ModelError, match=r"a closed Spline has no way-points .* open \(closed = false\)"):
+        way_points(closed)
+
+
+@pytest.mark.slow
+def test_a_path_between_way_points_may_be_free(points_scene, planned):
+    """It is faster, goes through the points, and keeps its limits, the tip's region among them."""
+    x = planned.motion[:, 0, 0]
+    region = {"tip_lower": (x.min() - 1e-3, 0.15), "tip_upper": (x.max() + 1e-3, 0.3)}
+    limits = replace(PlanLimits.of_scene(points_scene), **region)
+    free = plan_timing(points_scene, limits=limits, cells=80, free=True)
+    assert free.duration < 0.95 * planned.duration
+    assert free.excess <= 1e-3
+    tips = free(np.linspace(0.0, free.duration, 20001))[:, 0]
+    assert tips[:, 0].min() >= region["tip_lower"][0] - 1e-4
+    assert tips[:, 0].max() <= region["tip_upper"][0] + 1e-4
+    order = []
+    for point in points_scene.trajectory.path.points:
+        away = np.linalg.norm(tips - point, axis=1)
+        order.append(int(away.argmin()))
+        assert away.min() < 1.5e-4
+    assert order == sorted(order)
+    robot, t = points_scene.robot, np.linspace(0.0, free.duration, 4001)
+    q = np.stack([eq.q for eq in motors(robot, free, t, points_scene.start())])
+    assert np.abs(np.diff(q, axis=0)).max() / t[1] <= 1.002 * robot.rate_limit
+    assert np.abs(np.diff(q, 2, axis=0)).max() / t[1] ** 2 <= 1.002 * robot.acceleration_limit
+    with pytest.raises(ModelError, match="no way-points"):
+        plan_timing(load_scene(MODELS / "scenes" / "circle_from_file.toml"), free=True)
+
+
+@pytest.mark.slow
+def test_rods_with_weight_are_planned_for_by_shooting(scene):
+    vertical = load_scene(MODELS / "scenes" / "vertical.toml")
+    heavy = replace(scene, robot=vertical.robot)
+    planned = plan_timing(heavy, cells=40)
+    assert planned.excess <= 1e-3
+    t = np.linspace(0.0, planned.duration, 801)
+    q = np.stack([eq.q for eq in motors(heavy.robot, planned, t, heavy.start())])
+    assert np.abs(np.diff(q, axis=0)).max() / t[1] <= 1.001 * heavy.robot.rate_limit
+    assert np.abs(np.diff(q, 2, axis=0)).max() / t[1] ** 2 <= 1.001 * heavy.robot.acceleration_limit
+    assert np.abs(q - scene.start().q).max() > 0.1
+
+
+@pytest.mark.slow
+def test_margins_and_torque_limit_too(scene):
+    """A margin that the fastest motion does not leave is kept, and takes time."""
+    limits = PlanLimits.of_scene(scene)
+    free = plan_timing(scene, limits=limits, cells=40)
+    used = dict(zip(free.kinds, free.shares.max(axis=1), strict=True))
+    least = 1.0 - 0.95 * used["rod margin"] * (1.0 - limits.rod_margin)
+    kept = plan_timing(
+        scene, limits=replace(limits, rod_margin=least, torque=0.97 * used["motor torque"] * 1.5), cells=40
+    )
+    assert kept.duration > 1.001 * free.duration
+    assert kept.excess <= 1e-3
+    shares = dict(zip(kept.kinds, kept.shares.max(axis=1), strict=True))
+    assert max(shares["rod margin"], shares["motor torque"]) > 0.99
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"trajectory": PickAndPlace((-0.06, 0.22), (0.35, 0.22), 0.0, 0.0, 1.0)}, UnreachableError, "rod 0"),
+        ({"pose_limits": PoseLimits(tip_lower=(-0.1, 0.1), tip_upper=(0.1, 0.25))}, InfeasibleError, "20 mm outside"),
+        ({"pose_limits": PoseLimits(stiffness=70.0)}, InfeasibleError, "70 N/m"),
+        ({"trajectory": None, "tuning": None}, ModelError, "no reference"),
+        ({"trajectory": PickAndPlace((-0.06, 0.22), (-0.06, 0.22), 0.0, 0.0, 1.0)}, ModelError, "nothing to plan"),
+    ],
+)
+def test_what_cannot_be_planned_is_said_with_numbers(scene, change, error, message):
+    with pytest.raises(error, match=message):
+        plan_timing(replace(scene, **change))
+
+
+def test_a_torque_that_does_not_hold_the_tip_is_said(scene):
+    limits = replace(PlanLimits.of_scene(scene), torque=0.7)
+    with pytest.raises(InfeasibleError, match=r"to rest there takes .* N m, where 0.7 N m are allowed") as caught:
+        plan_timing(scene, limits=limits)
+    assert caught.value.limit == "motor torque"
+    assert 0.0 <= caught.value.s <= 0.17
+
+
+def test_a_path_through_a_fold_says_where(scene):
+    """Down between the motors the rods' branch ends."""
+    trajectory = Line(points=((-0.06, 0.22), (0.1, -0.2)), speed=0.1)
+    with pytest.raises((UnstableError, ConvergenceError, UnreachableError), match=r"the path at .* mm from its start"):
+        plan_timing(replace(scene, trajectory=trajectory))
+
+
+def test_the_command_writes_a_path_and_a_picture(tmp_path, capsys):
+    out = tmp_path / "fast.csv"
+    command = ["plan", str(MODELS / "scenes" / "pick_and_place.toml"), "--out", str(out), "--cells", "40"]
+    assert main([*command, "--json", "--tip-speed", "0.5"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["duration_s"] == pytest.approx(load_path(out).duration)
+    assert found["largest_excess"] <= 1e-3
+    assert found["top_speed_m_s"] == pytest.approx(0.5, rel=2e-3)
+    # Two rods of 5.6 g beside 250 g: less than all of them, for they are clamped at one end.
+    assert 0.005 < found["share_of_rods"] < 11.1 / 261.1
+    assert "38 % of the mass that moves, left out" in plan_table(found | {"share_of_rods": 0.38})
+    assert {row["limit"] for row in found["limits"]} >= {"motor rate", "change of rate", "tip speed"}
+    assert (tmp_path / "fast.png").stat().st_size > 10_000
+    out.write_text("mine")
+    assert main(command) == 1
+    assert "left alone" in capsys.readouterr().err
+    assert out.read_text() == "mine"
