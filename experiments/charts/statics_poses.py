@@ -10,7 +10,7 @@ from experiments.basin_trials import CLASSES as BASINS
 from experiments.basin_trials import find_poses
 from pcr_mpc import Equilibrium, PCRError, Robot, UnreachableError, distance_to_fold, solve_statics
 from pcr_mpc.plant.rods import elastica
-from tests import taylor_rod
+from tests.rods import taylor_rod
 
 # gentle, bent and taut as in `basins`. near fold: a gentle or bent pose moved in a random direction of tip and motors
 # to this part of the way to where an eigenvalue of K passes zero or a rod reaches its limit.
