@@ -35,7 +35,12 @@ _FLAGS = ("-O1", "-fno-semantic-interposition", "-finline-small-functions", "-fn
 def has_compiler() -> bool:
     """Whether there is the C compiler that the variable CC names (by default "cc"); where it is empty there is none."""
     command = _compiler()
-    return bool(command) and shutil.which(command[0]) is not None
+    return bool(command) and _there(command[0], os.environ.get("PATH", ""))
+
+
+@lru_cache
+def _there(command: str, path: str) -> bool:
+    return shutil.which(command, path=path or None) is not None
 
 
 def fastest(function: Any, wanted: bool = True) -> Any:

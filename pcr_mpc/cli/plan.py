@@ -12,7 +12,7 @@ from ..design.examination import moving_mass
 from ..errors import OutputError
 from ..files import require_free, saved, stamped, write_text
 from ..loop.scene.file import load_scene
-from ..report.planning import plan_table, plot_plan
+from ..report.plan_table import plan_table
 from ..study.planning.limits import PlanLimits
 from ..study.planning.plan import plan_timing
 
@@ -45,6 +45,8 @@ def plan(options: argparse.Namespace) -> int:
     def write(folder: Path) -> None:
         write_text(folder / out.name, stamped(planned.csv()))
         if picture is not None:
+            from ..report.planning import plot_plan  # of Matplotlib, which takes a second to import
+
             plot_plan(planned, folder / picture.name)
 
     folder, problem = saved(write, out.parent)

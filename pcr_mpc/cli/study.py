@@ -17,9 +17,9 @@ from ..loop.scene.scene import Scene
 from ..plant.uncertainty import load_uncertainty
 from ..report.choice_tables import choice_record, choice_table
 from ..report.csv_rows import write_rows
-from ..report.tables import tuning_comments, tuning_table
 from ..report.timing import plot_timing, timing_tables
 from ..report.trade_off import plot_trade_off
+from ..report.tuning_tables import tuning_comments, tuning_table
 from ..study.choice import choose
 from ..study.chosen_rung import require_plant_table, write_rung
 from ..study.episodes import lighter

@@ -19,9 +19,8 @@ from pcr_mpc.report.tables import (
     summary_table,
     table,
     times_table,
-    tuning_comments,
-    tuning_table,
 )
+from pcr_mpc.report.tuning_tables import tuning_comments, tuning_table
 from pcr_mpc.study.choice import Choice, Measured
 from pcr_mpc.study.episodes import Spread
 from pcr_mpc.study.estimates import Estimate

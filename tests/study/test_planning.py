@@ -26,14 +26,14 @@ from pcr_mpc import (
 from pcr_mpc.cli import main
 from pcr_mpc.linearisation.pose_limits import PoseLimits
 from pcr_mpc.loop.references.trajectory import PickAndPlace, smooth_step
-from pcr_mpc.report.planning import plan_table
+from pcr_mpc.report.plan_table import plan_table
 from pcr_mpc.study.planning.course import paced
-from pcr_mpc.study.planning.fastest import Problem, evaluated
 from pcr_mpc.study.planning.free import way_points
 from pcr_mpc.study.planning.meshing import points
 from pcr_mpc.study.planning.motion import Carrier
 from pcr_mpc.study.planning.pace import constant_pace, spline_of
 from pcr_mpc.study.planning.path import path_of
+from pcr_mpc.study.planning.timing import Problem, evaluated
 from tests.conftest import MODELS
 
 NO_MOTORS = {"rate": 1e6, "acceleration": 1e12, "torque": 1e3}
@@ -219,7 +219,7 @@ def test_slopes_are_those_of_differences(scene, pair):
     x, c = points(20, 6), constant_pace(20, 0.6).c
     c = c * (1.0 + 0.2 * np.sin(np.arange(len(c))))
     q = np.stack([inverse_statics(pair, p, guess=problem.pose).q for p in problem.course(x)[0]])
-    start = evaluated(problem, spline_of(c), x, q, tolerance=1e-9)
+    start = evaluated(problem, spline_of(c), x, q, tolerance=1e-9).with_slopes()
     change = 1e-5 * c * rng.standard_normal(len(c))
     ends = [evaluated(problem, spline_of(c + sign * change), x, start.turned.q.value, start.turned.poses, 1e-9)
             for sign in (1.0, -1.0)]  # fmt: skip

@@ -25,6 +25,7 @@ from .state import columns, record_size
 
 # Poses in one call of a graph: each size is built once, and any number of poses takes few calls.
 _SIZES, _GROWTH = tuple(2**k for k in range(9, -1, -1)), 8
+_LEAST_BLOCK = 32
 # Angle and slack beyond which the checks for one pose are asked, with their rounding and their words.
 _LARGE, _DOUBTFUL = 1e5, 1e-6
 
@@ -140,8 +141,7 @@ class _Work:
         self._recorded = np.zeros(count, dtype=bool)
         self.reasons = [""] * count
         self._wanted = np.full(count, np.inf)  # drift
-        self._kind = Kind(n, robot_layout(robot))
-        self._numbers = self._kind.pack(robot)
+        self._kind, self._numbers = _numbers(robot)
 
     def result(self) -> Equilibria:
         """All rows."""
@@ -263,21 +263,30 @@ class _Work:
         """Solve rows from records; a second time from where the first led, if that was on their branch."""
         changed = np.zeros(len(rows))
         for _ in range(2):
-            again, reached, first = np.zeros(len(rows), dtype=bool), [], 0
-            while first < len(rows):
-                size = next(size for size in _SIZES if size <= len(rows) - first)
-                some = slice(first, first + size)
-                records, verdict, results = self._called(method, rows[some], starts[some], along=False)
-                changed[some] += verdict[:, 2]
-                good = self._good(method, rows[some], verdict, changed[some])
-                self._take(rows[some][good], records[good], verdict[good], results[good])
-                near = (changed[some] <= BRANCH_CHANGE) & (verdict[:, 3] <= 0) & np.isfinite(verdict[:, 0])
-                again[some] = near & ~good
-                reached.append(records[again[some]])
+            # Outputs of a graph are valid until the next call: they are put together, and judged once.
+            found: list[tuple[np.ndarray, ...]] = []
+            first = 0
+            # The last few of many rows fill a block with others: a call costs as much as some of them.
+            filled = len(rows) + (-len(rows) % _LEAST_BLOCK if len(rows) > _LEAST_BLOCK else 0)
+            order = np.arange(filled) % len(rows) if len(rows) else np.arange(0)
+            while first < filled:
+                size = next(size for size in _SIZES if size <= filled - first)
+                some = order[first : first + size]
+                outputs = self._called(method, rows[some], starts[some], along=False)
+                found.append(outputs if size == filled else tuple(array.copy() for array in outputs))
                 first += size
-            if not again.any():
+            if not found:
                 return
-            rows, starts, changed = rows[again], np.concatenate(reached), changed[again]
+            records, verdict, results = (np.concatenate(arrays)[: len(rows)] for arrays in zip(*found, strict=True))
+            changed += verdict[:, 2]
+            good = self._good(method, rows, verdict, changed)
+            near = (changed <= BRANCH_CHANGE) & (verdict[:, 3] <= 0) & np.isfinite(verdict[:, 0])
+            again = near & ~good
+            if good.all():
+                self._take(rows, records, verdict, results)
+                return
+            self._take(rows[good], records[good], verdict[good], results[good])
+            rows, starts, changed = rows[again], records[again], changed[again]
 
     def _good(self, method: RodMethod, rows: Any, verdict: np.ndarray, changed: np.ndarray) -> np.ndarray:
         """Whether rods have followed to rounding, as `FirstRung` has it; NaN is not good."""
@@ -319,6 +328,12 @@ class _Work:
         to["residual_norm"][rows], to["drift"][rows] = verdict[:, 0], verdict[:, 4]
 
 
+@per_thread(maxsize=32)
+def _numbers(robot: Robot) -> tuple[Kind, np.ndarray]:
+    kind = Kind(robot.n_rods, robot_layout(robot))
+    return kind, kind.pack(robot)
+
+
 def _record(eq: Equilibrium) -> np.ndarray:
     assert eq.record is not None
     return eq.record
@@ -329,11 +344,16 @@ def _many(kind: Kind, method: RodMethod, count: int, along: bool, compiled: bool
     return BufferedFunction(_many_graph(kind, method, count, along, compiled))
 
 
+@graph_cache(maxsize=8)
+def _one_graph(kind: Kind, method: RodMethod, compiled: bool) -> Any:
+    warm = warm_step(kind, method, method.settling)
+    return machine_code(warm) if compiled else warm
+
+
 @graph_cache(maxsize=32)
 def _many_graph(kind: Kind, method: RodMethod, count: int, along: bool, compiled: bool) -> Any:
     """(record or starts, targets, numbers) -> records, verdicts, results of ``count`` poses."""
-    warm = warm_step(kind, method, method.settling)
-    warm = machine_code(warm) if compiled else warm
+    warm = _one_graph(kind, method, compiled)
     target, start, numbers = (ca.MX.sym(warm.name_in(i), *warm.size_in(i)) for i in range(3))
     found = warm(target, start, numbers)
     if not along:

@@ -21,6 +21,31 @@ _STEP = 1e-6  # of the motors, in radians, and of the tip, in rod lengths, for d
 
 
 @dataclass(frozen=True, eq=False)
+class Stand:
+    """The rods at M points of a motion, solved.
+
+    Attributes
+    ----------
+    pose : Equilibrium
+        From which their branch was followed.
+    poses : Equilibria
+        Within the tolerance.
+    q : ndarray, shape (M, n)
+        Motor angles [rad], to the square of that.
+    levers : ndarray, shape (M, n, 2)
+        G^+ [rad/N].
+    along : (ndarray, ndarray)
+        Derivatives of K, (M, 2, 2), and of G^+ along the path.
+    """
+
+    pose: Equilibrium
+    poses: Equilibria
+    q: np.ndarray
+    levers: np.ndarray
+    along: tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
 class Angles:
     """Motor angles at M points, and the motors' motion.
 
@@ -30,17 +55,19 @@ class Angles:
         [rad], [rad/s], [rad/s^2].
     torque : Linear, n components
         [N m].
-    poses : Equilibria
-    pose : Equilibrium
-        From which their branch was followed.
+    stand : Stand
     """
 
     q: Linear
     rate: Linear
     acceleration: Linear
     torque: Linear
-    poses: Equilibria
-    pose: Equilibrium
+    stand: Stand
+
+    @property
+    def poses(self) -> Equilibria:
+        """Of the stand."""
+        return self.stand.poses
 
 
 def followed(pose: Equilibrium, p: np.ndarray, q: np.ndarray, near: Equilibria | None) -> Equilibria:
@@ -110,32 +137,38 @@ def balanced(
     )
 
 
-def angles(
-    moved: Motion, pose: Equilibrium, q: np.ndarray, x: np.ndarray, near: Equilibria | None, tolerance: float
-) -> Angles:
-    """Motor angles, rates and accelerations of a motion at equally spaced points x; see `balanced`."""
+def stood(moved: Motion, pose: Equilibrium, q: np.ndarray, near: Equilibria | None, tolerance: float) -> Stand:
+    """Solve the rods for the forces of a motion; see `balanced`."""
+    poses, q = balanced(pose, moved.path[0].value, moved.force[0].value, q, near, tolerance)
+    levers = _levers(poses.dforce_dq)
+    p1 = moved.path[1].value
+    q1 = np.einsum("mij,mj->mi", levers, moved.force[1].value - np.einsum("mij,mj->mi", poses.dforce_dp, p1))
+    return Stand(pose, poses, q, levers, _along(pose, poses, p1, q1, levers))
+
+
+def angles(moved: Motion, stand: Stand, x: np.ndarray) -> Angles:
+    """Motor angles, rates and accelerations of a motion at the points x."""
     f, f1, f2 = moved.force
     p, p1, p2 = moved.path
-    poses, q = balanced(pose, p.value, f.value, q, near, tolerance)
-    stiffness, levers = poses.dforce_dp, _levers(poses.dforce_dq)
+    poses, levers, (k1, h1) = stand.poses, stand.levers, stand.along
+    stiffness = poses.dforce_dp
     # Along x: K P' + G q' = F', with H = G^+. The slopes: K dP + G dq = dF at every x.
     first = f1 - p1.through(stiffness)
-    k1, h1 = _along(pose, poses, p1.value, first.through(levers).value, levers)
-    k2, h2 = _derivative(x, k1), _derivative(x, h1)
     push = f - p.through(stiffness)
     push1 = f1 - p.through(k1) - p1.through(stiffness)
-    push2 = f2 - p.through(k2) - 2.0 * p1.through(k1) - p2.through(stiffness)
     second = f2 - p1.through(k1) - p2.through(stiffness)
-    q_lin = Linear(q, push.through(levers).slope)
+    q_lin = Linear(stand.q, push.through(levers).slope)
     turn = Linear(first.through(levers).value, push1.through(levers).slope + push.through(h1).slope)
-    turn2 = Linear(
-        second.through(levers).value + first.through(h1).value,
-        push2.through(levers).slope + 2.0 * push1.through(h1).slope + push.through(h2).slope,
-    )
+    turn2 = second.through(levers) + first.through(h1)
+    if p.slope.size:
+        k2, h2 = _derivative(x, k1), _derivative(x, h1)
+        push2 = f2 - p.through(k2) - 2.0 * p1.through(k1) - p2.through(stiffness)
+        slope = push2.through(levers).slope + 2.0 * push1.through(h1).slope + push.through(h2).slope
+        turn2 = Linear(turn2.value, slope)
     rate = turn * moved.theta
     acceleration = turn2 * moved.pace + 0.5 * (turn * moved.pace_slope)
     dtau = poses.dtorque_dq[:, :, None] * q_lin.slope + np.einsum("mji,mjd->mid", poses.dforce_dq, p.slope)
-    return Angles(q_lin, rate, acceleration, Linear(poses.motor_torque, dtau), poses, pose)
+    return Angles(q_lin, rate, acceleration, Linear(poses.motor_torque, dtau), stand)
 
 
 def _levers(coupling: np.ndarray) -> np.ndarray:

@@ -8,121 +8,27 @@ steps can then be ten times as long. The limits' shares are kept by an exact pen
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-from scipy import sparse
 from scipy.interpolate import BSpline
-from scipy.optimize import linprog
 
 from ... import interrupt
-from ...errors import ConvergenceError, PCRError
-from ...plant.statics.equilibria import Equilibria
-from ...plant.statics.equilibrium import Equilibrium
-from .angles import Angles, angles
-from .course import Course
-from .limits import PlanLimits, Use, uses
-from .motion import ORDERS_OF_PACE, Carrier, Motion, motion
-from .pace import duration, local_basis, quadrature, unit_splines
+from ...errors import PCRError
+from .motion import ORDERS_OF_PACE
+from .pace import local_basis, quadrature, unit_splines
+from .program import LinearProgram
+from .timing import Timing, evaluated
 
 _PENALTY = 1.0  # of log duration for exceeding a limit by all of it; slower motion buys it back for less
-_CORRECTIONS = 3
+_CORRECTIONS = 2
 _ENOUGH, _GOOD, _POOR = 0.8, 0.6, 0.3  # of the predicted gain: no correction, a wider and a narrower trust region
 _WIDER, _NARROWER = 1.6, 0.4
 _LEAST_GAIN, _LEAST_TRUST = 0.1, 1e-5
 _WIDEST_TRUST = 2.0
+_KEPT, _REPAIRED = 2e-4, 0.1  # excess that is none; share of a greater one that is worth a step
 # Which limits a program begins with, of the way to those that a change can reach at all; how often others are added.
 _NEAR_LIMIT, _ADDITIONS, _LP_TOLERANCE = 0.05, 4, 1e-7
-# Force of the rods that may be missing, in units of sum EI/L^2: on the way, and in the end.
-_NEAR, _EXACT = 1e-3, 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """What is planned.
-
-    Attributes
-    ----------
-    course : Course
-    pose : Equilibrium
-        Near the start.
-    carrier : Carrier
-    limits : PlanLimits
-    """
-
-    course: Course
-    pose: Equilibrium
-    carrier: Carrier
-    limits: PlanLimits
-
-
-@dataclass(frozen=True, eq=False)
-class Timing:
-    """A pace along a problem's course, and what follows from it at the points x.
-
-    Attributes
-    ----------
-    problem : Problem
-    pace : BSpline
-        b.
-    x : ndarray, shape (M,)
-    moved : Motion
-    turned : Angles
-    uses : list of Use
-    """
-
-    problem: Problem
-    pace: BSpline
-    x: np.ndarray
-    moved: Motion
-    turned: Angles
-    uses: list[Use]
-
-    @property
-    def duration(self) -> float:
-        """[s]."""
-        return duration(self.pace)
-
-    @property
-    def shares(self) -> np.ndarray:
-        """Largest share of each limit at each point, shape (limits, M)."""
-        return np.stack([use.largest for use in self.uses])
-
-    @property
-    def worst(self) -> float:
-        """Largest share of any limit."""
-        return float(self.shares.max())
-
-    def at(self, x: np.ndarray) -> Timing:
-        """Return the same at other points."""
-        q = np.stack([np.interp(x, self.x, angle) for angle in self.turned.q.value.T], axis=1)
-        return evaluated(self.problem, self.pace, x, q, self.near(x), _EXACT)
-
-    def near(self, x: np.ndarray) -> Equilibria:
-        """Poses at the points nearest to x."""
-        return self.turned.poses.rows(np.rint(np.interp(x, self.x, np.arange(len(self.x)))).astype(int))
-
-
-def evaluated(
-    problem: Problem,
-    pace: BSpline,
-    x: np.ndarray,
-    q: np.ndarray,
-    near: Equilibria | None = None,
-    tolerance: float = _NEAR,
-) -> Timing:
-    """Evaluate a pace at the points x; errors, ``near`` and ``tolerance`` as `balanced`.
-
-    Parameters
-    ----------
-    q : ndarray, shape (len(x), n)
-        Guess [rad].
-    """
-    values = np.stack([pace(x, nu=order) for order in range(ORDERS_OF_PACE)])
-    moved = motion(values, problem.course(x), problem.carrier, free=problem.course.unknowns > 0)
-    turned = angles(moved, problem.pose, q, x, near, tolerance)
-    return Timing(problem, pace, x, moved, turned, uses(problem.limits, moved, turned))
 
 
 def faster(
@@ -158,11 +64,13 @@ def faster(
     """
     for _ in range(most):
         interrupt.check()
-        program = _Program(timing, allowed)
+        program = _Program(timing.with_slopes(), allowed)
+        # Limits are to be kept, however little time that takes.
+        enough = min(tolerance, _REPAIRED * program.beyond) if program.beyond > _KEPT else tolerance
         found = None
         while found is None:
-            predicted, found = program.step(trust, tolerance)
-            if predicted < tolerance:
+            predicted, found = program.step(trust, enough)
+            if predicted < enough:
                 return timing
             if found is None:
                 trust *= _NARROWER
@@ -185,6 +93,11 @@ class _Program:
     ----------
     timing : Timing
     allowed : float
+
+    Attributes
+    ----------
+    beyond : float
+        By how much more than what is allowed of a limit is used.
     """
 
     def __init__(self, timing: Timing, allowed: float) -> None:
@@ -207,7 +120,17 @@ class _Program:
         self._slopes = np.concatenate([self._by_unknowns(slope) for slope in shares])
         self._where = np.tile(self._columns, (len(shares), 1))
         self._both = np.concatenate([np.full(use.share.value.size, use.both) for use in timing.uses])
-        self._beyond = self._excess(timing)
+        self.beyond = self._excess(timing)
+        self._reach = np.abs(self._slopes).sum(axis=1)
+        self._program = LinearProgram(np.append(self._gradient, _PENALTY))
+        self._known = np.zeros((2, len(self._both)), dtype=bool)
+        self._rows = np.empty(0, dtype=int), np.empty(0)
+        held = course.held()
+        self._held = np.zeros(0 if held is None else held.shape[0])
+        if held is not None:
+            held = held.toarray()
+            columns = np.broadcast_to(paces + np.arange(held.shape[1]), held.shape)
+            self._program.add_rows(self._held, self._held, columns, held)
 
     def _by_unknowns(self, slope: np.ndarray) -> np.ndarray:
         """From slopes by b, P and their derivatives, shape (M, D), to slopes by the unknowns that count."""
@@ -224,14 +147,14 @@ class _Program:
         for correction in range(_CORRECTIONS):
             change, excess = self._solved(rest, trust)
             if correction == 0:
-                predicted = -float(self._gradient @ change) + _PENALTY * (self._beyond - excess)
+                predicted = -float(self._gradient @ change) + _PENALTY * (self.beyond - excess)
                 if predicted < tolerance:
                     break
             trial = self._moved(change)
             if trial is None:
                 break
             gain = float(np.log(self._timing.duration / trial.duration))
-            gain += _PENALTY * (self._beyond - self._excess(trial))
+            gain += _PENALTY * (self.beyond - self._excess(trial))
             if best is not None and gain <= best[0]:
                 break
             best = gain, trial
@@ -246,55 +169,48 @@ class _Program:
 
     def _solved(self, rest: np.ndarray, trust: float) -> tuple[np.ndarray, float]:
         """Changes of the unknowns, and by how much limits are exceeded then, if shares are rest + slopes @ change."""
-        reach = trust * np.abs(self._slopes).sum(axis=1)
+        self._bound(rest, trust)
+        reach = trust * self._reach
         # Limits that are near; those that the change turns out to meet as well are added.
         near = _NEAR_LIMIT * reach
-        high, low = rest + near > self._allowed, self._both & (rest - near < -self._allowed)
+        self._add(rest + near > self._allowed, self._both & (rest - near < -self._allowed), rest)
         for _ in range(_ADDITIONS):
-            change, excess = self._with(high, low, rest, trust)
+            found = self._program.solved()
+            change, excess = found[:-1], float(found[-1])
             share = rest + (self._slopes * change[self._where]).sum(axis=1)
             most = self._allowed + excess + _LP_TOLERANCE
-            missed_high, missed_low = ~high & (share > most), ~low & self._both & (share < -most)
-            if not (missed_high.any() or missed_low.any()):
+            if not self._add(share > most, self._both & (share < -most), rest):
                 return change, excess
-            high |= missed_high
-            low |= missed_low
-        return self._with(rest + reach > self._allowed, self._both & (rest - reach < -self._allowed), rest, trust)
+        self._add(rest + reach > self._allowed, self._both & (rest - reach < -self._allowed), rest)
+        found = self._program.solved()
+        return found[:-1], float(found[-1])
 
-    def _with(self, high: np.ndarray, low: np.ndarray, rest: np.ndarray, trust: float) -> tuple[np.ndarray, float]:
-        """Solve the program with these limits from above and from below."""
+    def _bound(self, rest: np.ndarray, trust: float) -> None:
+        """Tell the program what is known of shares and steps."""
+        rows, signs = self._rows
+        high = np.concatenate([self._held, self._allowed - signs * rest[rows]])
+        low = np.concatenate([self._held, np.full(len(rows), -np.inf)])
+        self._program.bound_rows(low, high)
         count = len(self._gradient)
-        slopes = np.concatenate([self._slopes[high], -self._slopes[low]])
-        where = np.concatenate([self._where[high], self._where[low]])
-        # The last column is the excess.
-        entries = np.column_stack([slopes, np.full(len(slopes), -1.0)])
-        places = np.column_stack([where, np.full(len(where), count)])
-        ends = entries.shape[1] * np.arange(len(entries) + 1)
-        rows = sparse.csr_array((entries.ravel(), places.ravel(), ends), shape=(len(entries), count + 1))
-        bounds = np.concatenate([self._allowed - rest[high], self._allowed + rest[low]])
-        box = [(-trust / (1.0 + trust), trust)] * self._paces + [(-trust, trust)] * (count - self._paces)
-        held, equal = self._timing.problem.course.held(), None
-        if held is not None:
-            none = sparse.csr_array((held.shape[0], self._paces)), sparse.csr_array((held.shape[0], 1))
-            equal = sparse.hstack([none[0], held, none[1]]).tocsr()
-        found: Any = linprog(  # type: ignore[call-overload]  # its stubs know no sparse matrices
-            np.append(self._gradient, _PENALTY),
-            rows,
-            bounds,
-            equal,
-            None if equal is None else np.zeros(equal.shape[0]),
-            bounds=[*box, (0.0, None)],
-            method="highs-ds",
-            options={"presolve": False},  # there is nothing to find, and looking takes a quarter of the time
+        widest = np.full(count + 1, trust)
+        least = np.concatenate(
+            [np.full(self._paces, -trust / (1.0 + trust)), np.full(count - self._paces, -trust), [0]]
         )
-        if found.status != 0:
-            raise ConvergenceError(
-                f"a linear program of the plan was not solved: {found.message}; take fewer or more cells",
-                residual=float("nan"),
-                iterations=int(found.nit),
-                last=self._timing.pace.c,
-            )
-        return found.x[:-1], float(found.x[-1])
+        widest[-1] = np.inf
+        self._program.bound(least, widest)
+
+    def _add(self, high: np.ndarray, low: np.ndarray, rest: np.ndarray) -> bool:
+        """Add limits to the program from above and from below, but those that it has; whether there were any."""
+        new = [np.flatnonzero(wanted & ~known) for wanted, known in zip((high, low), self._known, strict=True)]
+        for rows, known in zip(new, self._known, strict=True):
+            known[rows] = True
+        rows, signs = np.concatenate(new), np.repeat([1.0, -1.0], [len(new[0]), len(new[1])])
+        # The last column is the excess.
+        values = np.column_stack([signs[:, None] * self._slopes[rows], np.full(len(rows), -1.0)])
+        columns = np.column_stack([self._where[rows], np.full(len(rows), len(self._gradient))])
+        self._program.add_rows(np.full(len(rows), -np.inf), self._allowed - signs * rest[rows], columns, values)
+        self._rows = np.append(self._rows[0], rows), np.append(self._rows[1], signs)
+        return len(rows) > 0
 
     def _moved(self, change: np.ndarray) -> Timing | None:
         """Evaluate a change; None if the rods cannot do it."""

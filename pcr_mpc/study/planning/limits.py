@@ -155,7 +155,7 @@ def _stiffness(least: float, turned: Angles) -> Use:
     # Where the pose is not even stable, what counts is that it is far beyond the limit.
     share = least / np.maximum(softest, 0.1 * least)
     slope = np.zeros_like(poses.q)
-    if share.max() > _WATCHED:
+    if turned.q.slope.size and share.max() > _WATCHED:
         for i in range(poses.q.shape[1]):
             change = (_turned(turned, i).dforce_dp - poses.dforce_dp) / _ANGLE
             slope[:, i] = np.einsum("mi,mij,mj->m", vector, change, vector)
@@ -168,7 +168,7 @@ def _rod_margin(least: float, turned: Angles) -> Use:
     """Lambda over lambda_c, over the most that is allowed."""
     poses, most = turned.poses, 1.0 - least
     here, slope = loads(poses, _WATCHED * most), np.zeros_like(poses.q)
-    if here.max() > _WATCHED * most:
+    if turned.q.slope.size and here.max() > _WATCHED * most:
         # Rods do not couple at a held tip: all motors at once.
         slope = (loads(_turned(turned, slice(None)), _WATCHED * most) - here) / _ANGLE
     return Use("rod margin", (1.0 / most) * Linear(here, slope[:, :, None] * turned.q.slope), both=False)
@@ -189,4 +189,4 @@ def _turned(turned: Angles, motors: int | slice) -> Equilibria:
     poses = turned.poses
     q = poses.q.copy()
     q[:, motors] += _ANGLE
-    return followed(turned.pose, poses.p, q, poses)
+    return followed(turned.stand.pose, poses.p, q, poses)

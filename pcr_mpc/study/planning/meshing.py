@@ -11,8 +11,8 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse.linalg import spsolve
 
 from .course import PacedPath
-from .fastest import Timing, evaluated
 from .pace import constant_pace, duration, spline_of, times, unit_splines
+from .timing import Timing, evaluated
 
 PER_CELL = 3
 FINE = 10 * PER_CELL  # points to a cell where the result is checked

@@ -21,6 +21,7 @@ import numpy as np
 from .linear import Linear
 
 ORDERS_OF_PACE, ORDERS_OF_PATH = 4, 5  # b to b''', P to P''''
+BY_PACE, BY_PATH_TOO = ORDERS_OF_PACE, ORDERS_OF_PACE + 2 * ORDERS_OF_PATH
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,7 @@ class Motion:
     path: tuple[Linear, Linear, Linear]
 
 
-def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, *, free: bool) -> Motion:
+def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, width: int) -> Motion:
     """Compute motion and forces.
 
     Parameters
@@ -67,13 +68,13 @@ def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, *, free: bool) 
     path : ndarray, shape (5, M, 2)
         P and its derivatives.
     carrier : Carrier
-    free : bool
-        Whether the path changes too: slopes are by b to b''', then by x of P to P'''', then by y.
+    width : int
+        Of the slopes: 0 for none, BY_PACE by b to b''', BY_PATH_TOO then by x of P to P'''', then by y.
     """
-    b, b1, b2, b3 = (_unknown(values[:, None], (order,), free) for order, values in enumerate(pace))
+    b, b1, b2, b3 = (_unknown(values[:, None], (order,), width) for order, values in enumerate(pace))
     first = ORDERS_OF_PACE
     p, p1, p2, p3, p4 = (
-        _unknown(values, (first + order, first + ORDERS_OF_PATH + order), free) for order, values in enumerate(path)
+        _unknown(values, (first + order, first + ORDERS_OF_PATH + order), width) for order, values in enumerate(path)
     )
     theta = b.sqrt()
     theta1 = b1 / (2.0 * theta)
@@ -89,8 +90,7 @@ def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, *, free: bool) 
     return Motion(theta, b, b1, speed[0], acceleration[0], acceleration[1] * theta, force, (p, p1, p2))
 
 
-def _unknown(values: np.ndarray, places: tuple[int, ...], free: bool) -> Linear:
-    width = ORDERS_OF_PACE + (2 * ORDERS_OF_PATH if free else 0)
+def _unknown(values: np.ndarray, places: tuple[int, ...], width: int) -> Linear:
     slope = np.zeros((*values.shape, width))
     for component, place in enumerate(places):
         if place < width:

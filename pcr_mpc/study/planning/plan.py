@@ -7,34 +7,26 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from tqdm import tqdm
 
 from ...errors import ConvergenceError, InfeasibleError, ModelError, PCRError, checked_number
 from ...loop.scene.scene import Scene
-from ...plant.statics.equilibrium import Equilibrium
-from ...plant.statics.free_tip import inverse_statics
-from .course import PacedPath, paced
-from .fastest import Problem, Timing, evaluated, faster
+from .course import paced
+from .fastest import faster
 from .free import freed, way_points
 from .limits import PlanLimits
 from .meshing import FINE, points, repaced, with_points
 from .motion import Carrier
-from .pace import cells_of, constant_pace, spline_of, times
+from .pace import cells_of, spline_of, times
 from .path import TipPath, path_of
+from .starting import STATICS, evened, started, where
 from .timed_path import TimedPath
+from .timing import Problem, Timing, evaluated
 
-_ROUGH_CELLS = 40
 _CELL = 1e-2  # s
 _FEWEST, _MOST = 80, 240  # cells
 _CELLS_PER_PIECE = 5
 _FREE_PIECES, _FREE_UNIT = 40, 0.05  # of a free path's spline; of its length, by which it moves in units of trust
-_STATICS = 40  # poses that are found one by one
-_REST = 1e4  # s: so slow that motion asks for nothing
-# Of one over the duration, with which the shares of some limits grow.
-_POWERS = {"change of rate": 3.0, "tip acceleration": 2.0, "tip jerk": 3.0, "motor rate": 2.0, "tip speed": 1.0}
-_TRIALS = 40
-_AIM, _NEAR_ENOUGH = 0.8, 0.8  # of the limits; of the duration that is expected to use so much of them
 _ITERATIONS = (40, 12, 6)
 _GAINS = (1e-2, 1e-3)  # of the duration, that are none: roughly, and in the end
 _ALLOWED = 1.0 - 5e-4  # share of the limits that is used, so that they are kept between the points too
@@ -117,7 +109,7 @@ def plan_timing(
 
         _require_region(scene, limits, path)
         problem = Problem(paced(path), scene.start(), carrier_of(scene, span), limits)
-        timing = faster(_started(problem, path), most=_ITERATIONS[0], tolerance=_GAINS[0], told=told)
+        timing = faster(evened(started(problem, path)), most=_ITERATIONS[0], tolerance=_GAINS[0], told=told)
         wanted = cells or int(np.clip(math.ceil(timing.duration / _CELL), _FEWEST, _MOST))
         timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
         timing = faster(timing, most=_ITERATIONS[1], trust=0.3, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
@@ -174,8 +166,10 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tupl
             fine = timing.at(between)
             continue
         x = with_points(timing.x, fine.shares, between, _ALLOWED)
-        timing = faster(timing.at(x), most=_ITERATIONS[2], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
-        fine = timing.at(between)
+        more = faster(timing.at(x), most=_ITERATIONS[2], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
+        if more.pace is timing.pace and len(x) == len(timing.x):
+            break
+        timing, fine = more, more.at(between)
     if fine.worst > 1.0 + _LARGEST_EXCESS:
         limit, at = np.unravel_index(int(fine.shares.argmax()), fine.shares.shape)
         raise ConvergenceError(
@@ -191,7 +185,7 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tupl
 
 def _require_region(scene: Scene, limits: PlanLimits, path: TipPath) -> None:
     """Raise if the path leaves the scene's region, in whatever time."""
-    s = np.linspace(0.0, path.length, 10 * _STATICS + 1)
+    s = np.linspace(0.0, path.length, 10 * STATICS + 1)
     p = path.derivatives(s)[0]
     if limits.tip_lower is not None and limits.tip_upper is not None:
         low, high = np.array(limits.tip_lower), np.array(limits.tip_upper)
@@ -199,7 +193,7 @@ def _require_region(scene: Scene, limits: PlanLimits, path: TipPath) -> None:
         at = int(beyond.argmax())
         if beyond[at] > 0.0:
             raise InfeasibleError(
-                f"{_where(s[at], p[at])} is {1e3 * beyond[at]:.3g} mm outside the tip's region, from {low} to {high} "
+                f"{where(s[at], p[at])} is {1e3 * beyond[at]:.3g} mm outside the tip's region, from {low} to {high} "
                 "m; move the path, or widen the region",
                 status="outside",
                 limit="tip region",
@@ -209,95 +203,7 @@ def _require_region(scene: Scene, limits: PlanLimits, path: TipPath) -> None:
         try:
             scene.robot.require_reachable(at_point)
         except PCRError as error:
-            raise type(error)(f"{_where(length, at_point)}: {error}", **error.details, s=float(length)) from None
-
-
-def _where(s: float, p: np.ndarray) -> str:
-    return f"the path at {1e3 * s:.4g} mm from its start, p = ({p[0]:.6g}, {p[1]:.6g}) m,"
-
-
-def _started(problem: Problem, path: TipPath) -> Timing:
-    """A pace that the robot can keep."""
-    x = points(_ROUGH_CELLS, 2)
-    q = _resting(problem, path, x)
-    acceleration = 5.0 * problem.pose.robot.force_scale / problem.carrier.mass
-    # The polynomial of degree 7 has a largest acceleration of 7.5 length / duration^2.
-    seconds = math.sqrt(7.5 * path.length / acceleration)
-    still = evaluated(problem, constant_pace(_ROUGH_CELLS, max(_REST, 1e3 * seconds)), x, q)
-    _require_rest(still, path)
-    found: Timing | None = None
-    resting = still.turned.q.value, still.turned.poses
-    kept: Timing | None = None
-    for _ in range(_TRIALS):
-        try:
-            found = evaluated(problem, constant_pace(_ROUGH_CELLS, seconds), x, *resting)
-        except PCRError:
-            found = None
-        if kept is not None and (found is None or found.worst > 1.0):
-            return kept
-        if found is None:
-            seconds *= 2.0
-            continue
-        shares = dict(zip((use.limit for use in found.uses), found.shares.max(axis=1), strict=True))
-        ratio = max((shares[kind] / _AIM) ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares)
-        if found.worst <= 1.0:
-            kept = found
-            if ratio > _NEAR_ENOUGH:
-                return kept
-        seconds *= ratio if found.worst <= 1.0 else max(1.1, ratio)
-    raise ConvergenceError(
-        f"no pace was found at which the robot keeps its limits on this path: in {seconds:.3g} s it would still use "
-        f"{found.worst if found else math.inf:.3g} times what is allowed; is a limit almost reached at rest?",
-        residual=found.worst if found else math.inf,
-        iterations=_TRIALS,
-        last=seconds,
-    )
-
-
-def _resting(problem: Problem, path: TipPath, x: np.ndarray) -> np.ndarray:
-    """Motor angles that hold the tip on the path at the points x."""
-    s = np.linspace(0.0, path.length, _STATICS)
-    p = path.derivatives(s)[0]
-    pose: Equilibrium = problem.pose
-    payload = problem.carrier.weight - pose.robot.tip_weight
-    found = []
-    for length, tip in zip(s, p, strict=True):
-        try:
-            pose = inverse_statics(pose.robot, tip, payload, guess=pose)
-        except PCRError as error:
-            raise type(error)(f"{_where(length, tip)}: {error}", **error.details, s=float(length)) from None
-        found.append(pose.q)
-    course = problem.course
-    assert isinstance(course, PacedPath)
-    return np.asarray(CubicSpline(s, np.array(found))(np.clip(course.nominal(x), 0.0, path.length)))
-
-
-def _require_rest(still: Timing, path: TipPath) -> None:
-    """Raise if a limit is exceeded where the tip stands still."""
-    shares = still.shares
-    if shares.max() <= 1.0:
-        return
-    limit, at = np.unravel_index(int(shares.argmax()), shares.shape)
-    kind, robot = still.uses[limit].limit, still.problem.pose.robot
-    value = {
-        "motor torque": f"takes {np.abs(still.turned.torque.value[at]).max():.4g} N m, where "
-        f"{still.problem.limits.torque:.4g} N m are allowed",
-        "motor angle": f"needs motor angles of {np.array2string(still.turned.q.value[at], precision=4)} rad, where "
-        f"the stops are {robot.angle_limits.tolist()} rad",
-        "stiffness": f"leaves a stiffness of {still.problem.limits.stiffness / shares[limit, at]:.4g} N/m, where "
-        f"{still.problem.limits.stiffness:.4g} N/m are to be kept",
-        "rod margin": f"leaves a rod margin of {1 - shares[limit, at] * (1 - still.problem.limits.rod_margin):.4g}, "
-        f"where {still.problem.limits.rod_margin:.4g} is to be kept",
-    }.get(kind, f"uses {shares[limit, at]:.4g} times what is allowed")
-    p = still.moved.path[0].value[at]
-    s = float(still.problem.course.nominal(still.x[at]))  # type: ignore[attr-defined]
-    raise InfeasibleError(
-        f"{_where(s, p)} cannot be kept at any speed: to rest there {value} ({kind}); move the path, or allow more",
-        status="infeasible at rest",
-        limit=kind,
-        share=float(shares[limit, at]),
-        s=s,
-    )
+            raise type(error)(f"{where(length, at_point)}: {error}", **error.details, s=float(length)) from None
 
 
 def _distance(path: TipPath, tips: np.ndarray) -> float:

@@ -1,0 +1,121 @@
+"""A pace along a course, and what follows from it: motion, motor angles, shares of the limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline, CubicSpline
+
+from ...plant.statics.equilibria import Equilibria
+from ...plant.statics.equilibrium import Equilibrium
+from .angles import Angles, Stand, angles, stood
+from .course import Course
+from .limits import PlanLimits, Use, uses
+from .motion import BY_PACE, BY_PATH_TOO, ORDERS_OF_PACE, Carrier, Motion, motion
+from .pace import duration
+
+# Force of the rods that may be missing, in units of sum EI/L^2: on the way, and in the end.
+_NEAR, _EXACT = 1e-4, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is planned.
+
+    Attributes
+    ----------
+    course : Course
+    pose : Equilibrium
+        Near the start.
+    carrier : Carrier
+    limits : PlanLimits
+    """
+
+    course: Course
+    pose: Equilibrium
+    carrier: Carrier
+    limits: PlanLimits
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """A pace along a problem's course, and what follows from it at the points x.
+
+    Attributes
+    ----------
+    problem : Problem
+    pace : BSpline
+        b.
+    x : ndarray, shape (M,)
+    moved : Motion
+    turned : Angles
+    uses : list of Use
+    """
+
+    problem: Problem
+    pace: BSpline
+    x: np.ndarray
+    moved: Motion
+    turned: Angles
+    uses: list[Use]
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return duration(self.pace)
+
+    @property
+    def shares(self) -> np.ndarray:
+        """Largest share of each limit at each point, shape (limits, M)."""
+        return np.stack([use.largest for use in self.uses])
+
+    @property
+    def worst(self) -> float:
+        """Largest share of any limit."""
+        return float(self.shares.max())
+
+    def at(self, x: np.ndarray) -> Timing:
+        """Return the same at other points."""
+        q = np.asarray(CubicSpline(self.x, self.turned.q.value)(x))
+        return evaluated(self.problem, self.pace, x, q, self.near(x), _EXACT)
+
+    def with_slopes(self) -> Timing:
+        """Return the same, and how it changes."""
+        width = BY_PATH_TOO if self.problem.course.unknowns else BY_PACE
+        return _timing(
+            self.problem, self.pace, self.x, _moving(self.problem, self.pace, self.x, width), self.turned.stand
+        )
+
+    def near(self, x: np.ndarray) -> Equilibria:
+        """Poses at the points nearest to x."""
+        return self.turned.poses.rows(np.rint(np.interp(x, self.x, np.arange(len(self.x)))).astype(int))
+
+
+def evaluated(
+    problem: Problem,
+    pace: BSpline,
+    x: np.ndarray,
+    q: np.ndarray,
+    near: Equilibria | None = None,
+    tolerance: float = _NEAR,
+) -> Timing:
+    """Evaluate a pace at the points x, without slopes; errors, ``near`` and ``tolerance`` as `balanced`.
+
+    Parameters
+    ----------
+    q : ndarray, shape (len(x), n)
+        Guess [rad].
+    """
+    moved = _moving(problem, pace, x, 0)
+    return _timing(problem, pace, x, moved, stood(moved, problem.pose, q, near, tolerance))
+
+
+def _moving(problem: Problem, pace: BSpline, x: np.ndarray, width: int) -> Motion:
+    values = np.stack([pace(x, nu=order) for order in range(ORDERS_OF_PACE)])
+    return motion(values, problem.course(x), problem.carrier, width)
+
+
+def _timing(problem: Problem, pace: BSpline, x: np.ndarray, moved: Motion, stand: Stand) -> Timing:
+    turned = angles(moved, stand, x)
+    return Timing(problem, pace, x, moved, turned, uses(problem.limits, moved, turned))
