@@ -7,7 +7,8 @@ checked before it is handed over, every return code is read, and x exists only i
 
 from __future__ import annotations
 
-from typing import NoReturn
+from functools import cached_property
+from typing import Any, NoReturn
 
 import numpy as np
 import osqp
@@ -15,6 +16,7 @@ import scipy.sparse as sp
 
 from .qp_solver import CheckedQP
 
+_CORE = osqp.OSQP().ext
 _RHO = 0.1
 _SOLVED = int(osqp.SolverStatus.OSQP_SOLVED)
 
@@ -36,7 +38,10 @@ class QPSolver(CheckedQP):
     def __init__(
         self, A: sp.csc_matrix, tolerance: float = 1e-5, max_iterations: int = 4000, *, identity: bool = False
     ) -> None:
-        self._settings = {
+        self._settings = _CORE.OSQPSettings()
+        _CORE.osqp_set_default_settings(self._settings)
+        self._rho = 1.0 if identity else _RHO
+        settings = {
             "verbose": False,
             "eps_abs": tolerance,
             "eps_rel": tolerance,
@@ -44,32 +49,33 @@ class QPSolver(CheckedQP):
             "adaptive_rho": 1,  # by iterations, not by time
             "adaptive_rho_interval": 25,  # twice as eager as OSQP's defaults: the longest solves take half as long
             "adaptive_rho_tolerance": 2.0,
-            "rho": 1.0 if identity else _RHO,
+            "rho": self._rho,
             "scaling": 0 if identity else 2,
             "check_termination": 5,
             "polishing": False,
         }
+        for name, value in settings.items():
+            setattr(self._settings, name, value)
         super().__init__(A, max_iterations, identity)
 
     def _set_up(self) -> None:
-        # A new one: OSQP scales and unscales A at every update of P, and its rounding would stay.
-        self._osqp, self._allowed = osqp.OSQP(), self._most
-        self._set_up_core()
-        # Its own object, without the wrapper that looks at every argument again.
-        self._core = self._osqp._solver
+        # A new one: OSQP scales and unscales A at every update of P, and its rounding would stay. By its own module,
+        # for the wrapper takes a millisecond to look at every argument again.
+        self._allowed, self._settings.max_iter = self._most, self._most
+        self._core = _CORE.OSQPSolver(*self._beginning, self.m, self.n, self._settings)
 
-    def _set_up_core(self) -> None:
+    @cached_property
+    def _beginning(self) -> tuple[Any, ...]:
+        """P, q, A, l and u of a new workspace, in OSQP's own form."""
         n, m = self.n, self.m
-        if self._identity:
-            self._osqp.setup(sp.identity(n, format="csc"), np.zeros(n), self._matrix, -np.ones(m), np.ones(m),
-                             **self._settings)  # fmt: skip
-            return
-        # An explicit pattern: zeros of the start must not drop out of it.
-        rows = np.concatenate([np.arange(j + 1) for j in range(n)])
-        starts = np.arange(n + 1) * (np.arange(n + 1) + 1) // 2
-        diagonal = (rows == np.repeat(np.arange(n), np.arange(1, n + 1))).astype(float)
-        hessian = sp.csc_matrix((diagonal, rows, starts), shape=(n, n))
-        self._osqp.setup(hessian, np.zeros(n), self._matrix, -np.ones(m), np.ones(m), **self._settings)
+        hessian = sp.identity(n, format="csc")
+        if not self._identity:
+            # An explicit pattern: zeros of the start must not drop out of it.
+            rows = np.concatenate([np.arange(j + 1) for j in range(n)])
+            starts = np.arange(n + 1) * (np.arange(n + 1) + 1) // 2
+            diagonal = (rows == np.repeat(np.arange(n), np.arange(1, n + 1))).astype(float)
+            hessian = sp.csc_matrix((diagonal, rows, starts), shape=(n, n))
+        return _CORE.CSC(hessian), np.zeros(n), _CORE.CSC(self._matrix.astype(float)), -np.ones(m), np.ones(m)
 
     def _start_from(self, x: np.ndarray, y: np.ndarray | None) -> None:
         if code := self._core.warm_start(x, y):
@@ -94,8 +100,8 @@ class QPSolver(CheckedQP):
     def _solve_into(self, x: np.ndarray, y: np.ndarray, most: int) -> tuple[int, float]:
         core = self._core
         if most != self._allowed:
-            self._osqp.update_settings(max_iter=most)
-            self._allowed = most
+            self._allowed = self._settings.max_iter = most
+            core.update_settings(self._settings)
         core.solve()
         info = core.info
         if info.status_val != _SOLVED:
@@ -105,7 +111,7 @@ class QPSolver(CheckedQP):
                 limit = int(np.argmax(np.abs(core.solution.prim_inf_cert)))
             # An unsolved problem's iterate and step size must not start the next one.
             self._start_from(np.zeros(self.n), np.zeros(self.m))
-            self._osqp.update_settings(rho=self._settings["rho"])
+            core.update_rho(self._rho)
             raise self._unsolved(status, iterations, float(info.run_time), limit)
         found = core.solution
         x[:], y[:] = found.x, found.y

@@ -100,6 +100,26 @@ def test_rods_that_do_not_follow_take_the_ladder(pair, centre):
     assert outlook.models[0](there, np.ones(2)) == pytest.approx(wanted(there, np.ones(2)), abs=1e-9)
 
 
+def test_rods_that_are_near_take_more_iterations_and_no_ladder(pair, centre, monkeypatch):
+    """An estimate that jumps by 5 mm: all places, and the motor target, miss at once."""
+    foresight, x = made(pair, centre, Places(0, 3, 3))
+    there = x + [0.005, -0.004, 0, 0, 0.02, 0.01]
+    foresight.inputs["estimate"][:-2] = there
+    foresight.inputs["measured"][:] = [*there[:2], *there[4:]]
+    foresight.rows["path"][:] = there
+    foresight.rows["states"][:] = there
+    foresight._graph()
+    assert foresight._outputs["good"].tolist() == [0.5] * len(foresight._outputs["good"])  # else the test says nothing
+    monkeypatch.setattr(Foresight, "_climb", None)
+    monkeypatch.setattr(Foresight, "_follow_target", None)
+    outlook = foresight()
+    plant = Plant(pair)
+    plant.reset(x, centre)
+    wanted = linearise(plant, there, np.zeros(2), DT)
+    for model in outlook.models:
+        assert model(there, np.ones(2)) == pytest.approx(wanted(there, np.ones(2)), abs=1e-7)
+
+
 def test_a_place_that_cannot_be_had_is_named_and_forgotten(pair, centre):
     foresight, x = made(pair, centre)
     before = foresight().models[0].A.copy()

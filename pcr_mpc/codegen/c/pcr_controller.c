@@ -7,6 +7,8 @@
 #include "pcr_parts.h"
 
 #define SAME_ANGLE 1e-9
+#define NEAR 0.5  /* of `good`: another iteration will do */
+#define AGAIN 3   /* evaluations at most for rods that are near */
 
 static pcr_room room_of(pcr_controller *c)
 {
@@ -29,11 +31,36 @@ static void foresee(pcr_controller *c)
     pcr_graph_foresight(c->arg, c->res, c->iw, c->w);
 }
 
-/* Take the long way for rods that have not followed, one place after the other. Returns 0 if all have. */
+/* Look ahead again from where the rods have come that are near, all places at once. Returns 0 if there are none. */
+static int go_on(pcr_controller *c)
+{
+    const double *good = c->out + PCR_OUT_GOOD;
+    int any = 0;
+    for (int j = 0; j < PCR_PLACES; j++) {
+        if (good[j] == NEAR) {
+            memcpy(c->in + PCR_IN_RECORDS + j * PCR_RECORD, c->out + PCR_OUT_FOLLOWED + j * PCR_RECORD,
+                   PCR_RECORD * sizeof *good);
+            any = 1;
+        }
+    }
+    if (good[PCR_PLACES] == NEAR) {
+        memcpy(c->in + PCR_IN_TARGET, c->out + PCR_OUT_FOLLOWED_TARGET, PCR_TARGET * sizeof *good);
+        any = 1;
+    }
+    if (any) {
+        foresee(c);
+    }
+    return any;
+}
+
+/* More iterations for rods that have not followed, then the long way, one place after the other. Returns 0 if all
+   have. */
 static int bring_along(pcr_controller *c)
 {
     const double *good = c->out + PCR_OUT_GOOD;
     double result[PCR_RESULT];
+    for (int again = 0; again < AGAIN && go_on(c); again++) {
+    }
     for (int j = 0; j < PCR_PLACES; j++) {
         if (good[j] < 1.0) {
             double x[PCR_STATES], *record = c->in + PCR_IN_RECORDS + j * PCR_RECORD;

@@ -20,6 +20,9 @@ from ...plant.rods.numbers import Kind
 from ...plant.statics.equilibrium import Equilibrium
 from .foresight_graph import Places, foresight_graph
 
+_NEAR = 0.5  # of ``good``: see `foresight_graph`
+_AGAIN = 3  # evaluations at most for rods that are near
+
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
@@ -69,7 +72,8 @@ class Outlook:
 class Foresight:
     """`foresight_graph` with its memory: the rods at every place, and the motor target.
 
-    Rods that one or two Newton iterations do not bring along take the ladder of `Plant`.
+    Rods that one or two Newton iterations do not bring along take as many again, all places at once, and those that are
+    not near then take the ladder of `Plant`.
 
     Parameters
     ----------
@@ -227,8 +231,8 @@ class Foresight:
             As `linearise`, at one of the places; the rods are then where they were.
         """
         self._graph()
-        all_good, self.strayed, *_ = self._decisions.tolist()
-        if not all_good:
+        worst, self.strayed, *_ = self._decisions.tolist()
+        if not worst >= 1.0:  # NaN is not good
             try:
                 self._bring_along()
             except BaseException:
@@ -237,9 +241,26 @@ class Foresight:
         self._memory[:] = self._next
         return self.outlook
 
+    def _go_on(self) -> bool:
+        """Evaluate again from where the rods have come that are near, all places at once; False if there are none."""
+        found, good = self._outputs, self._outputs["good"]
+        near = (good == _NEAR).tolist()
+        if not any(near):
+            return False
+        for j, record in enumerate(_rows(found["followed"])):
+            if near[j]:
+                self._records[j] = record
+        if near[-1]:
+            self.inputs["target"][:] = found["followed_target"]
+        self._graph()
+        return True
+
     def _bring_along(self) -> None:
-        """Take the ladder for the rods that have not followed, one place after the other."""
+        """Bring along the rods that have not followed: more iterations, then the ladder, one place after the other."""
         good, late = self._outputs["good"], dict[int, np.ndarray]()
+        for _ in range(_AGAIN):
+            if not self._go_on():
+                break
         try:
             for j in range(self.places.count):
                 if good[j] < 1.0:

@@ -8,6 +8,7 @@ of a place start from its neighbour's, and only the last of them has a way to go
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from ...plant.rods.follower import BRANCH_CHANGE
 _SOLVED, _DERIVATIVES = 1e-8, 1e-4
 _LARGEST_STEP = 0.1  # of the motor target in a period [rad]
 _VERDICT = [_SOLVED, _DERIVATIVES, BRANCH_CHANGE, 0.0, LARGEST_DRIFT]
+_NEAR = 1e-2  # residual from which Newton's method is as good as sure to get there, on the branch that it is on
 _LATEST = 10.0  # periods that motors may be late
 _SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
 
@@ -83,7 +85,8 @@ def foresight_graph(
     -------
     casadi.Function
         With named inputs and outputs; one column of ``followed`` (records) and ``models`` for each place. ``good`` is 1
-        for each place, and then for the motor target, whose rods have followed, else 0. ``decisions`` are [the least of
+        for each place, and then for the motor target, whose rods have followed, 1/2 where they are so near that the
+        graph should be evaluated again from there, else 0. ``decisions`` are [the least of
         ``good``, how far the sum of the commands is from the angles ahead [rad], and what `condensing` calls sizes].
         What the next period starts from is, from the second record on, in the order of the inputs ``records`` to
         ``reckoned``; from the models of the plan on, the outputs are those that `checking` takes in.
@@ -228,12 +231,13 @@ def _place(
     memory = given.records[: sizes(model).memory, j]
     graph = graph_of(model, 2 if last else 1)
     record, packed, verdict = graph(x, force, given.payloads[j], memory, given.numbers, given.mass, given.dt)
-    return record, packed, _kept(verdict, [*_VERDICT, STIFFEST, STIFFEST]), x
+    return record, packed, _grade(verdict, [*_VERDICT, STIFFEST, STIFFEST]), x
 
 
-def _kept(verdict: Any, limits: list[float]) -> Any:
-    """1 where no entry exceeds its limit; NaN does."""
-    return ca.mmin(verdict <= ca.DM(limits))
+def _grade(verdict: Any, limits: list[float]) -> Any:
+    """1 where no entry exceeds its limit, 1/2 where only the residuals do, and not by far, else 0; NaN exceeds all."""
+    near = [_NEAR, math.inf, *limits[2:4], math.inf, *limits[5:]]
+    return (ca.mmin(verdict <= ca.DM(limits)) + ca.mmin(verdict <= ca.DM(near))) / 2
 
 
 def _moved(packed: Any, x: Any, u: Any, n: int) -> Any:
@@ -254,7 +258,7 @@ def _shifted(target: StepModel, given: Any, force: Any, n: int) -> tuple[Any, An
     pose = ca.vertcat(end[:2], end[4:] + given.shift)
     memory = given.target[: sizes(target).memory]
     record, verdict, found, _, g = force_graph(target, 1)(pose, memory, given.target_numbers)
-    good = _kept(verdict, [_DERIVATIVES, *_VERDICT[1:]])
+    grade = _grade(verdict, [_DERIVATIVES, *_VERDICT[1:]])
     numbers = target.kind.unpack(given.target_numbers)
     square = g @ g.T
     a, b, d = square[0, 0], square[0, 1], square[1, 1]
@@ -262,8 +266,8 @@ def _shifted(target: StepModel, given: Any, force: Any, n: int) -> tuple[Any, An
     missing = given.forces[:, -1] + force + numbers.tip_mass * numbers.gravity - found
     step = g.T @ ca.vertcat(d * missing[0] - b * missing[1], a * missing[1] - b * missing[0]) / determinant
     step = step * ca.fmin(1, _LARGEST_STEP / ca.fmax(ca.norm_inf(step), 1e-300))
-    moves = ca.logic_and(given.carries, ca.logic_and(good, determinant >= _SINGULAR * a * d))
-    return ca.if_else(moves, given.shift + step, given.shift), ca.if_else(good, record, given.target), good
+    moves = ca.logic_and(given.carries, ca.logic_and(grade >= 1, determinant >= _SINGULAR * a * d))
+    return ca.if_else(moves, given.shift + step, given.shift), ca.if_else(grade, record, given.target), grade
 
 
 def _signs(model: StepModel, given: Any, record: Any) -> Any:
