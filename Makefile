@@ -77,7 +77,7 @@ mutants: $(READY)  ## which of N changes of the code the tests notice, in result
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,docs,peers,cluster,tune,mujoco,view,browser]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,docs,peers,cluster,tune,mujoco,view,browser,fmu]"
 	touch $(READY)
 
 clean:

@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,8 +45,12 @@ def name_problem(name: Any) -> str | None:
 
 def stamped(text: str, comment: tuple[str, str] = ("# ", "")) -> str:
     """Text with a last line of comment that says who wrote it; ``comment`` is what begins and ends such a line."""
-    last = f"{_STAMP} ({_digest(text.encode())}); once changed by hand it is not overwritten without --force"
-    return f"{text}{comment[0]}{last}{comment[1]}\n"
+    return f"{text}{_line(_digest(text.encode()), comment)}"
+
+
+def _line(digest: str, comment: tuple[str, str] = ("# ", "")) -> str:
+    said = f"{_STAMP} ({digest}); once changed by hand it is not overwritten without --force"
+    return f"{comment[0]}{said}{comment[1]}\n"
 
 
 def picture_metadata(path: Path) -> dict[str, str] | None:
@@ -64,6 +69,14 @@ def ours(path: Path) -> bool:
     *rest, last = content.splitlines(keepends=True) or [b""]
     found = re.search(rf"{_STAMP} \((\w+)\)".encode(), last)
     return found is not None and found[1].decode() == _digest(b"".join(rest))
+
+
+def stamp_archive(path: Path) -> None:
+    """Let the comment of a ZIP archive say who wrote it, in the last line of the file."""
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.comment = b"\n" + _line("0" * len(_digest(b""))).encode()
+    content = b"".join(path.read_bytes().splitlines(keepends=True)[:-1])
+    path.write_bytes(content + _line(_digest(content)).encode())
 
 
 def require_free(path: Path, *, force: bool = False) -> None:

@@ -25,6 +25,7 @@ examples:
   pcr-mpc identify lemniscate run.csv --out mine.toml   a robot's numbers from recorded motion
   pcr-mpc excite lemniscate --duration 6                a motion worth recording
   pcr-mpc generate lemniscate --out build/lemniscate       controller and plant as C
+  pcr-mpc fmu lemniscate --part plant                   for Simulink, Modelica and others, by FMI
   pcr-mpc hil lemniscate                                in real time, the controller over a wire
   pcr-mpc view lemniscate                               the robot live in a browser: pull at it
   pcr-mpc replay results/lemniscate                     a recorded run as one page
@@ -214,6 +215,22 @@ def parser() -> argparse.ArgumentParser:
                       "file, or a name of pcr-mpc models")  # fmt: skip
     code.add_argument("--solver", choices=("osqp", "daqp"), help="QP solver (default: the tuning's)")
     code.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default build/NAME)")
+
+    unit = command(
+        "fmu",
+        "fmu",
+        "fmu",
+        "Pack the plant or the controller of a scene as a functional mock-up unit (FMI, co-simulation), for Simulink, "
+        "Modelica tools and others to import: the C of `generate` with a binary for this computer. docs/fmu.md has "
+        "its variables, and how to couple the two.",
+    )
+    unit.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
+    unit.add_argument("--part", choices=("plant", "controller"), required=True, help="what it is a model of")
+    unit.add_argument("--version", type=int, choices=(2, 3), default=2,
+                      help="of FMI; 2 is what most tools read (default 2)")  # fmt: skip
+    unit.add_argument("--controller", type=Path, metavar="FILE|NAME", help="tuning instead of the scene's own: a "
+                      "file, or a name of pcr-mpc models")  # fmt: skip
+    unit.add_argument("--out", type=Path, metavar="FILE", help="file to write (default build/pcr_SCENE_PART.fmu)")
 
     server = command(
         "serve",

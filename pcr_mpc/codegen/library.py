@@ -24,15 +24,15 @@ _LIMITS = {"rate": 1, "rate change": 2, "angle": 4} | KIND_BITS
 _FIRST_MEASUREMENT = 3
 
 
-def build(folder: Path, *words: str) -> Path:
-    """Compile a generated folder into a library that can be loaded; ``words`` are variables of its Makefile.
+def run_make(folder: Path, *words: str) -> None:
+    """Let make do what the words say in a generated folder.
 
     Raises
     ------
     CompilerError
         There is no compiler or no make, or they failed.
     """
-    command = ["make", "-s", "-C", str(folder), *words, "libpcr.so"]
+    command = ["make", "-s", "-C", str(folder), *words]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, errors="replace")
     except OSError as error:
@@ -41,6 +41,17 @@ def build(folder: Path, *words: str) -> Path:
         ) from None
     if done.returncode:
         raise CompilerError(f"cannot build {folder}: {done.stderr.strip()}", command=command)
+
+
+def build(folder: Path, *words: str) -> Path:
+    """Compile a generated folder into a library that can be loaded; ``words`` are variables of its Makefile.
+
+    Raises
+    ------
+    CompilerError
+        There is no compiler or no make, or they failed.
+    """
+    run_make(folder, *words, "libpcr.so")
     return folder / "libpcr.so"
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-SLOW = ("what_else_is_stable",)
+SLOW = ("fmu_loop", "what_else_is_stable")
 EXAMPLES = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in SLOW else [])
     for path in sorted((ROOT / "examples").glob("*.py"))

@@ -199,6 +199,19 @@ pcr_result pcr_controller_set_parameters(pcr_controller *c, const pcr_parameters
     return PCR_OK;
 }
 
+pcr_result pcr_controller_restore(pcr_controller *c, const pcr_controller *saved)
+{
+    if (c == NULL || saved == NULL || c == saved) {
+        return PCR_ARGUMENT;
+    }
+    if (!saved->started) {
+        return PCR_NOT_STARTED;
+    }
+    memcpy(c, saved, sizeof *c);
+    pcr_law_restore(c, saved);
+    return PCR_OK;
+}
+
 /* A row of the window: state at the end of a period, rates in it, and the force that the rods carry at its end. */
 static void write_row(double *to, int row)
 {

@@ -19,6 +19,15 @@ static void reset_rates(pcr_controller *c)
                  c->rates_doubles, c->rates_ints);
 }
 
+void pcr_law_restore(pcr_controller *c, const pcr_controller *saved)
+{
+    reset_rates(c);
+    memcpy(c->rates_doubles, saved->rates_doubles, sizeof c->rates_doubles);
+    memcpy(c->rates_ints, saved->rates_ints, sizeof c->rates_ints);
+    pcr_qp_restore(&c->rates, &saved->rates);
+    pcr_limited_restore(&c->limited, &saved->limited);
+}
+
 static void reset_solvers(pcr_controller *c)
 {
     c->limits_matter = 0;

@@ -91,6 +91,18 @@ static int fetch(pcr_limited *limited, int kinds)
     return 0;
 }
 
+void pcr_limited_restore(pcr_limited *limited, const pcr_limited *saved)
+{
+    memmove(limited, saved, sizeof *limited);
+    if (saved->kinds >= 0) {
+        pcr_qp_setup(&limited->qp, &pcr_limited_shapes[saved->kinds], &settings, limited->starts, limited->rows, NULL,
+                     limited->doubles, limited->ints);
+        memcpy(limited->doubles, saved->doubles, sizeof limited->doubles);
+        memcpy(limited->ints, saved->ints, sizeof limited->ints);
+        pcr_qp_restore(&limited->qp, &saved->qp);
+    }
+}
+
 /* L from the upper triangle of P column by column, which is the lower one row by row; 0 if P is positive definite. */
 static int factorise(double factor[PCR_INPUTS][PCR_INPUTS], const double *p)
 {

@@ -52,6 +52,9 @@ typedef struct {
 /* Forget everything. */
 void pcr_limited_reset(pcr_limited *limited, double penalty);
 
+/* Be a copy of `saved`, wherever that was. */
+void pcr_limited_restore(pcr_limited *limited, const pcr_limited *saved);
+
 /* Solve in at most `most` iterations, from the inputs `warm` (NULL: from where the last solution was). P is the upper
    triangle, column by column; models, x and dt predict what the limits of poses are about. */
 void pcr_limited_solve(pcr_limited *limited, const double *p, const double *q, const double *l, const double *u,

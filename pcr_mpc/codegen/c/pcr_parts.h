@@ -49,6 +49,7 @@ int pcr_near(pcr_controller *controller, pcr_pose_limits *limits);
 
 /* pcr_law.c: the plan of the linear MPC, from what `out` of the graph holds; the ladder below it. */
 void pcr_law_reset(pcr_controller *controller);
+void pcr_law_restore(pcr_controller *controller, const pcr_controller *saved);
 void pcr_decide(pcr_controller *controller, const pcr_pose_limits *limits, pcr_output *output);
 void pcr_fall_back(pcr_controller *controller, const double *x, const double *wanted, const double *inputs,
                    pcr_output *output);

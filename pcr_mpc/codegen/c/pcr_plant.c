@@ -8,6 +8,23 @@
 
 #define ROUGH 1e-4
 
+/* Let the rods of such numbers follow from `record` to where the plant is. Returns 0 if they did. */
+static int bring(pcr_plant *plant, const double *numbers, double *record)
+{
+    double result[PCR_RESULT];
+    pcr_room room;
+    room.arg = plant->arg;
+    room.res = plant->res;
+    room.iw = plant->iw;
+    room.w = plant->w;
+    if (pcr_follow(pcr_graph_follow, pcr_graph_finish, numbers, plant->x, plant->x + 4, 1e-6, record, result, room)) {
+        return 1;
+    }
+    memcpy(plant->memory, record, PCR_LOADS * sizeof *record);
+    memcpy(plant->memory + PCR_LOADS, result, 2 * sizeof *result);
+    return 0;
+}
+
 pcr_result pcr_plant_init(pcr_plant *plant, const pcr_pose *pose)
 {
     if (plant == NULL) {
@@ -15,32 +32,52 @@ pcr_result pcr_plant_init(pcr_plant *plant, const pcr_pose *pose)
     }
     memset(plant, 0, sizeof *plant);
     const pcr_pose *at = pose == NULL ? &pcr_scene_pose : pose;
+    double record[PCR_RECORD];
     memcpy(plant->memory, pcr_scene_memory, sizeof plant->memory);
     memcpy(plant->numbers, pcr_scene_plant_numbers, sizeof plant->numbers);
     memcpy(plant->x, at->p, sizeof at->p);
     memcpy(plant->x + 4, at->q, sizeof at->q);
+    plant->tip_mass = plant->numbers[PCR_TIP_MASS];
     if (pose != NULL) {
-        double record[PCR_RECORD], result[PCR_RESULT];
-        pcr_room room;
-        room.arg = plant->arg;
-        room.res = plant->res;
-        room.iw = plant->iw;
-        room.w = plant->w;
         for (int i = 0; i < PCR_STATES; i++) {
             if (!isfinite(plant->x[i])) {
                 return PCR_ARGUMENT;
             }
         }
         memcpy(record, pcr_scene_record, sizeof record);
-        if (!PCR_PLANT_MASSLESS
-            || pcr_follow(pcr_graph_follow, pcr_graph_finish, plant->numbers, at->p, at->q, 1e-6, record, result,
-                          room)) {
+        if (!PCR_PLANT_MASSLESS || bring(plant, plant->numbers, record)) {
             return PCR_OUT_OF_REACH;
         }
-        memcpy(plant->memory, record, PCR_LOADS * sizeof *record);
-        memcpy(plant->memory + PCR_LOADS, result, 2 * sizeof *result);
     }
     plant->started = 1;
+    return PCR_OK;
+}
+
+pcr_result pcr_plant_set_numbers(pcr_plant *plant, const double *numbers)
+{
+    double record[PCR_RECORD] = {0.0}, all[PCR_NUMBERS];
+    if (pcr_plant_status(plant) != PCR_OK) {
+        return PCR_NOT_STARTED;
+    }
+    if (numbers == NULL || !PCR_PLANT_MASSLESS) {
+        return PCR_ARGUMENT;
+    }
+    for (int i = 0; i < PCR_NUMBERS; i++) {
+        if (isnan(numbers[i])) { /* angles without stops are infinite */
+            return PCR_ARGUMENT;
+        }
+    }
+    memcpy(all, numbers, sizeof all);
+    all[PCR_TIP_MASS] += plant->payload;
+    memcpy(record, plant->memory, PCR_LOADS * sizeof *record);
+    if (!(all[PCR_TIP_MASS] > 0.0)) {
+        return PCR_ARGUMENT;
+    }
+    if (bring(plant, all, record)) {
+        return PCR_OUT_OF_REACH;
+    }
+    plant->tip_mass = numbers[PCR_TIP_MASS];
+    memcpy(plant->numbers, all, sizeof all);
     return PCR_OK;
 }
 
@@ -104,7 +141,7 @@ pcr_result pcr_plant_carry(pcr_plant *plant, double payload)
     /* M of the tip's motion [a, b; b, d], before and after; what is picked up was at rest, and momentum stays. */
     double *mass = plant->numbers + PCR_TIP_MASS, a = *mass, b = 0.0, d = *mass;
     const double before = plant->payload, change = payload - before;
-    *mass = pcr_scene_plant_numbers[PCR_TIP_MASS] + payload;
+    *mass = plant->tip_mass + payload;
     if (PCR_PLANT_CONSTANT) {
         double *matrix = plant->memory + PCR_LOADS + 2;
         a = matrix[0];

@@ -9,6 +9,7 @@
 
 #define FIRM 1e-2 /* of the tolerance: DAQP's own, so that a row that it may leave out cannot decide on acceptance */
 #define ACTIVE_BELOW (DAQP_ACTIVE | DAQP_LOWER)
+#define EVERYTHING (DAQP_UPDATE_M | DAQP_UPDATE_d | DAQP_UPDATE_sense | DAQP_UPDATE_Rinv | DAQP_UPDATE_v)
 
 void daqp_refine_primal(DAQPWorkspace *work);
 void ldp2qp_solution(DAQPWorkspace *work);
@@ -156,8 +157,7 @@ int pcr_qp_setup(pcr_qp *qp, const pcr_qp_shape *shape, const pcr_qp_settings *s
     qp->problem.sense = qp->told;
     reset_daqp_workspace(work);
     tell_senses(qp);
-    const int all = DAQP_UPDATE_M | DAQP_UPDATE_d | DAQP_UPDATE_sense | DAQP_UPDATE_Rinv | DAQP_UPDATE_v;
-    qp->flag = daqp_update_ldp(all, work, &qp->problem);
+    qp->flag = daqp_update_ldp(EVERYTHING, work, &qp->problem);
     return qp->flag == DAQP_EXIT_NONCONVEX ? PCR_LEFT_NOT_CONVEX : 0;
 }
 
@@ -337,4 +337,13 @@ void pcr_qp_resume(pcr_qp *qp, const double *x, const double *y, int solved, dou
     if (solved) {
         memcpy(qp->held, y, (size_t)rows_of(qp->shape) * sizeof *y);
     }
+}
+
+void pcr_qp_restore(pcr_qp *qp, const pcr_qp *saved)
+{
+    /* All of it follows from the data and from the multipliers that are held. */
+    qp->settings = saved->settings;
+    tell_senses(qp);
+    reset_daqp_workspace(&qp->work);
+    qp->flag = daqp_update_ldp(EVERYTHING, &qp->work, &qp->problem);
 }

@@ -358,3 +358,34 @@ void pcr_qp_resume(pcr_qp *qp, const double *x, const double *y, int solved, dou
     memcpy(qp->solution.y, y, (size_t)qp->shape->m * sizeof *y);
     osqp_update_rho(&qp->solver, memory);
 }
+
+/* The vector in the place of one of `saved`; OSQP exchanges vectors by their pointers. */
+static OSQPVectorf *counterpart(pcr_qp *qp, const pcr_qp *saved, const OSQPVectorf *of)
+{
+    return qp->work.y + (of - saved->work.y);
+}
+
+void pcr_qp_restore(pcr_qp *qp, const pcr_qp *saved)
+{
+    OSQPWorkspace *to = &qp->work;
+    const OSQPWorkspace *from = &saved->work;
+    to->x = counterpart(qp, saved, from->x);
+    to->x_prev = counterpart(qp, saved, from->x_prev);
+    to->z = counterpart(qp, saved, from->z);
+    to->z_prev = counterpart(qp, saved, from->z_prev);
+    to->delta_y = counterpart(qp, saved, from->delta_y);
+    qp->data.l = counterpart(qp, saved, saved->data.l);
+    qp->data.u = counterpart(qp, saved, saved->data.u);
+    to->scaled_prim_res = from->scaled_prim_res;
+    to->scaled_dual_res = from->scaled_dual_res;
+    to->rho_inv = from->rho_inv;
+    to->rho_updated = from->rho_updated;
+    to->last_rel_kkt = from->last_rel_kkt;
+    qp->settings = saved->settings;
+    qp->info = saved->info;
+    qp->scaling.c = saved->scaling.c;
+    qp->scaling.cinv = saved->scaling.cinv;
+    qp->linear.sigma = saved->linear.sigma;
+    qp->linear.rho_inv = saved->linear.rho_inv;
+    qp->first_rho = saved->first_rho;
+}

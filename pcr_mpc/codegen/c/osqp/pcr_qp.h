@@ -82,6 +82,10 @@ int pcr_qp_judge(pcr_qp *qp, double primal, double dual);
 double pcr_qp_memory(const pcr_qp *qp);
 void pcr_qp_resume(pcr_qp *qp, const double *x, const double *y, int solved, double memory);
 
+/* Be what `saved` was, a copy of a solver of the same shape whose pointers mean nothing any more: qp was set up anew, and
+   the doubles and ints of that solver were copied into its own. */
+void pcr_qp_restore(pcr_qp *qp, const pcr_qp *saved);
+
 #ifdef __cplusplus
 }
 #endif

@@ -1,0 +1,1 @@
+"""Plant and controller of a scene as functional mock-up units."""
