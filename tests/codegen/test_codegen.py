@@ -217,7 +217,9 @@ def test_cpp_may_include_the_header(each, tmp_path):
 @pytest.mark.slow
 def test_nothing_of_the_library_allocates_or_prints(each, tmp_path):
     folder = copied(each, tmp_path)
-    make(folder, *QUICK, "libpcr.a")
+    make(folder, *QUICK, "size")
+    kept, whole = ((folder / name).stat().st_size for name in ("controller.linked", "libpcr.a"))
+    assert 50e3 < kept < whole
     listed = subprocess.run(["nm", "-u", str(folder / "libpcr.a")], capture_output=True, text=True, check=True).stdout
     needed = {line.split()[-1] for line in listed.splitlines() if " U " in f" {line}"}
     assert "sqrt" in needed  # it lists what it should
