@@ -16,7 +16,7 @@ _KNOWN = {
     "untold_delay motors",
     "tuning": "name horizon position_weight velocity_weight angle_weight input_weight tolerance max_iterations "
     "fallback model observer law pd period solver",
-    "model": "method segments steps scheme inertia linearise payload predict_delay compiled",
+    "model": "method segments steps scheme inertia linearise payload predict_delay compiled angles motor_lag",
 }
 
 

@@ -16,6 +16,7 @@ from pcr_mpc.codegen.library import GeneratedController, build
 from pcr_mpc.codegen.scope import check_scope
 from pcr_mpc.codegen.subject import Subject
 from pcr_mpc.codegen.tables import parameters
+from pcr_mpc.control.tuning import load_tuning
 from pcr_mpc.errors import GenerationError, PCRError
 from pcr_mpc.loop.controller.make_controller import make_controller
 from pcr_mpc.loop.scene.file import load_scene
@@ -31,8 +32,8 @@ QUICK = ["CFLAGS=-O0", "GRAPH_CFLAGS=-O0"]
 INCLUDED = ["-isystem", "osqp/public", "-isystem", "osqp/private", "-isystem", "daqp/include"]
 
 
-def generated(scene, folder, solver="osqp"):
-    assert main(["generate", str(SCENES / f"{scene}.toml"), "--solver", solver, "--out", str(folder)]) == 0
+def generated(scene, folder, solver="osqp", *words):
+    assert main(["generate", str(SCENES / f"{scene}.toml"), "--solver", solver, "--out", str(folder), *words]) == 0
     return folder
 
 
@@ -85,10 +86,17 @@ def test_the_lemniscate_runs_in_c_as_it_does_in_python(lemniscate):
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "solver"), [("sensors", "osqp"), ("payload", "osqp"), ("lemniscate", "daqp"), ("limited", "daqp")]
+    ("scene", "solver", "words"),
+    [
+        ("sensors", "osqp", ()),
+        ("payload", "osqp", ()),
+        ("lemniscate", "daqp", ()),
+        ("limited", "daqp", ()),
+        ("sensors", "osqp", ("--controller", "default")),
+    ],
 )
-def test_a_scene_runs_in_c_as_it_does_in_python(scene, solver, tmp_path):
-    said = run(make(generated(scene, tmp_path / scene, solver), *QUICK))
+def test_a_scene_runs_in_c_as_it_does_in_python(scene, solver, words, tmp_path):
+    said = run(make(generated(scene, tmp_path / scene, solver, *words), *QUICK))
     assert said.count("rung or iterations in 0 of ") == 2
     assert max(float(word) for word in re.findall(r"at most ([\d.e+-]+) rad/s", said)) <= 1e-9
 
@@ -112,11 +120,13 @@ def hostile(rng, k, x):
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize(("solver", "most"), [("osqp", 25), ("daqp", 15)])
-def test_the_worst_leads_to_the_same_rungs(solver, most, tmp_path):
+@pytest.mark.parametrize(
+    ("tuning", "solver", "most"), [("lemniscate", "osqp", 25), ("lemniscate", "daqp", 15), ("default", "osqp", 25)]
+)
+def test_the_worst_leads_to_the_same_rungs(tuning, solver, most, tmp_path):
     # Few iterations and a load that throws the tip about: every rung of the ladder has its turn.
-    scene = load_scene(SCENES / "lemniscate.toml")
-    scene = scene.tuned(replace(scene.tuning, max_iterations=most, solver=solver))
+    tuning = load_tuning(ROOT / "controllers" / f"{tuning}.toml")
+    scene = load_scene(SCENES / "lemniscate.toml").tuned(replace(tuning, max_iterations=most, solver=solver))
     subject = Subject.of_scene(scene)
     write_folder(subject, None, tmp_path / "c")
     library = build(tmp_path / "c", f"CC={CC}", *QUICK)
@@ -238,6 +248,28 @@ def test_what_c_does_not_have_is_said_by_name(scene, part):
     loaded = load_scene(SCENES / f"{scene}.toml")
     with pytest.raises(GenerationError, match=r"closed form only|nothing to track") as error:
         check_scope(loaded, loaded.tuning)
+    assert error.value.part == part
+
+
+REFUSED = {
+    "known_lag": "latency of the tip [s]",
+    "lqr": "law",
+    "nonlinear": "law",
+    "open_loop": "law",
+    "pd": "law",
+    "shooting": "method of the controller's rods",
+}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "controllers").glob("*.toml")), ids=lambda path: path.stem)
+def test_every_shipped_tuning_is_generated_or_refused_by_name(path):
+    scene = load_scene(SCENES / "lemniscate.toml")
+    tuning, part = load_tuning(path), REFUSED.get(path.stem)
+    if part is None:
+        assert check_scope(scene.tuned(tuning), tuning) is tuning
+        return
+    with pytest.raises(GenerationError) as error:
+        check_scope(scene.tuned(tuning), tuning)
     assert error.value.part == part
 
 
