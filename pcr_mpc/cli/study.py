@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import interrupt
+from ..codegen.timing import time_in_c
 from ..errors import OutputError
 from ..files import require_folder, require_free, results, saved
 from ..loop.scene.file import load_scene
@@ -61,7 +62,7 @@ def time_loop(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     folder = options.out or Path("results") / "timing" / scene.name
     require_folder(folder, _TIMING, force=options.overwrite)
-    result = time_scene(scene, options.steps, progress=True)
+    result = time_scene(scene, options.steps, progress=True, in_c=time_in_c)
 
     def write(where: Path) -> None:
         with results(where) as staged:

@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from ..loop.run.run import Run
+from .solver import flops
 from .subject import Subject
 
 _LICENCES = {
@@ -24,9 +25,7 @@ def readme(subject: Subject, run: Run) -> str:
     kind = subject.work.foresight.step_models[0].kind
     watched = ", ".join(subject.kinds) or "none"
     worst = tuning.max_iterations
-    n, m, _, of_a, _ = subject.limited[-1].sizes
-    # OSQP solves with its factor, and DAQP looks at all rows and updates a factor of those that are active.
-    each = 4 * (subject.limited[-1].factor + of_a + n + m) if tuning.solver == "osqp" else 2 * of_a + 4 * n**2
+    each = flops(subject.limited[-1], tuning.solver, tuning.horizon * subject.robot.n_rods)
     units = "\n".join(f"| {i} | `{name}` | {unit} |" for i, (name, unit) in enumerate(kind.units.items()))
     values = {
         "scene": scene.name,

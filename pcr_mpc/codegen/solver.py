@@ -63,6 +63,15 @@ class Shape:
         return patterns + 9 * (n + m) + of_p + 3 * of_a + 3 * m + 1
 
 
+def flops(shape: Shape, solver: str, inputs: int) -> int:
+    """Floating-point operations of an iteration: OSQP solves with its factor; DAQP looks at all rows, and updates a
+    factor of those that are active."""
+    n, m, _, of_a, _ = shape.sizes
+    if solver == "osqp":
+        return 4 * (shape.factor + of_a + n + m)
+    return 2 * of_a + 4 * ((n + inputs) // 2 if shape.identity else n) ** 2
+
+
 def daqp_room(shape: Shape, inputs: int) -> tuple[int, int]:
     """Memory that ``pcr_qp_setup`` takes for DAQP [doubles], [ints]; it is told no slacks of soft rows."""
     n, m, *_ = shape.sizes

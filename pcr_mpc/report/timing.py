@@ -21,6 +21,8 @@ def timing_tables(result: dict[str, Any]) -> str:
     components = result["components"]
     rows = [(f"{c['name']} ({c['method']})", *(_us(c[key]) for key in _FIGURES), str(c["n"])) for c in components]
     parts = [table(("wall time [us]", *_FIGURES, "calls"), rows)]
+    if "c" in result:
+        parts.append(_table_of_c(result))
     steps = [c for c in components if c.get("misses")]
     rows = []
     for c in steps:
@@ -85,6 +87,31 @@ def timing_tables(result: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
+def _table_of_c(result: dict[str, Any]) -> str:
+    """Steps in C beside Python's, and the longest that a control step can be."""
+    own = {"plant step of the scene", "plant step", "control step"}
+    rows = [
+        (f"{c['name']}, {c['method'] if c['method'].startswith('C') else 'Python'}",
+         *(_us(c["cpu"][key]) for key in _FIGURES), str(c["n"]))
+        for c in result["components"]
+        if c["name"] in own and (c["method"].startswith("C") or c["name"] != "plant step")
+    ]  # fmt: skip
+    parts = [table(("CPU time [us]", *_FIGURES, "steps"), rows)]
+    for row in result["c"]:
+        if "missing" in row:
+            parts.append(f"no times of C with {row['solver']}: {row['missing']}")
+            continue
+        worst = row["worst"]
+        text = f"longest control step in C with {row['solver']}, by its count: {worst['iterations']} iterations"
+        if worst["us"] is None:
+            text += f" of {worst['flops']:.2g} operations; all steps took as many iterations, so no time is told"
+        else:
+            text += (f" x {worst['iteration_us']:.3g} us (all soft rows, {worst['flops']:.2g} operations) + "
+                     f"{worst['rest_us']:.3g} us = {worst['us']:.3g} us")  # fmt: skip
+        parts.append(text)
+    return "\n".join(parts)
+
+
 def _us(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
@@ -108,9 +135,9 @@ def plot_timing(result: dict[str, Any], path: Path) -> None:
 
 
 def _series(histogram: dict[str, Any]) -> list[tuple[str, str, str]]:
-    colours = {"plant step": BLUE, "control step": ORANGE}
+    colours = {"plant step": BLUE, "control step": ORANGE, "plant step in C": SKY, "control step in C": GREEN}
     return [(name, collector, colours[name]) for name in colours if name in histogram
-            for collector in ("collector on", "collector off") if any(histogram[name][collector])]  # fmt: skip
+            for collector, counts in histogram[name].items() if any(counts)]  # fmt: skip
 
 
 def _from(histogram: dict[str, Any]) -> float:
@@ -123,7 +150,7 @@ def _from(histogram: dict[str, Any]) -> float:
 def _histogram(axis: Any, histogram: dict[str, Any]) -> None:
     edges = np.array(histogram["edges_us"])
     for name, collector, colour in _series(histogram):
-        counts, on = np.array(histogram[name][collector]), collector.endswith("on")
+        counts, on = np.array(histogram[name][collector]), collector == "collector on"
         style = {"fill": on, "alpha": 0.35 if on else 1.0, "lw": 1.4}
         axis.stairs(counts, edges, color=colour, label=f"{name}, {collector}", **style)
     axis.set(xscale="log", yscale="log", xlabel="wall time of a step [us]", ylabel="steps per bin")
@@ -141,7 +168,7 @@ def _tail(axis: Any, histogram: dict[str, Any]) -> None:
         share = 1 - np.cumsum(counts) / counts.sum()
         beyond = share > 0.5 / counts.sum()
         last = max(last, edges[1:][beyond].max(initial=0.0))
-        style = "-" if collector.endswith("on") else ":"
+        style = ":" if collector.endswith("off") else "-"
         axis.plot(edges[1:][beyond], share[beyond], style, color=colour, label=f"{name}, {collector}")
     for name, colour in (("plant step", BLUE), ("control step", RED)):
         for hz in _BUDGETS_HZ[name] if name in histogram else ():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 
 from .. import interrupt
 from ..compiled import has_compiler
+from ..errors import PCRError
 from ..loop.controller.make_controller import make_controller
 from ..loop.controller.tracking import TrackingController
 from ..loop.demand.feed_forward import feed_forward
@@ -31,7 +34,10 @@ _OTHER_SOLVER = 0.2  # share of the control steps that are repeated with another
 _BINS = np.geomspace(1.0, 1e5, 101)  # us
 
 
-def time_scene(scene: Scene, steps: int = 100_000, *, progress: bool = False) -> dict[str, Any]:
+def time_scene(
+    scene: Scene, steps: int = 100_000, *, progress: bool = False,
+    in_c: Callable[[Scene, str, int], dict[str, Any]] | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Measure plant steps, the linearisation's solves and control steps along a closed-loop run of a scene.
 
     Everything is replayed on the states and inputs of that run, over and over, back to back. Plant steps are those of
@@ -41,6 +47,8 @@ def time_scene(scene: Scene, steps: int = 100_000, *, progress: bool = False) ->
     ----------
     steps : int
         Plant steps, and control steps; a fifth and a hundredth of them by multiple and single shooting.
+    in_c : callable, optional
+        See `codegen.timing.time_in_c`: times the steps of the same scene in C. None: C is left out.
 
     Returns
     -------
@@ -52,8 +60,10 @@ def time_scene(scene: Scene, steps: int = 100_000, *, progress: bool = False) ->
         ``control_parts``: mean times [us] of what a control step consists of, and ``iterations``: times [us] by number
         of QP iterations, both of steps that nobody interrupted. ``solvers``: of the linear MPC, the scene's QP solver
         and the others on the same states: {solver, step, inside, iterations, n}, with p50, p99 and max of the
-        control step and of the solver [us], and of iterations. ``overhead``: see `call_overhead`. ``machine``, with
-        its load before and after; ``versions``.
+        control step and of the solver [us], and of iterations. ``c``: for each QP solver of the linear MPC {solver,
+        worst}, see ``in_c``, or {solver, missing}, why there is no C; its times are among the components, by the
+        methods "C, OSQP" and "C, DAQP", closed loop, plant steps in between. ``overhead``: see `call_overhead`.
+        ``machine``, with its load before and after; ``versions``.
     """
     before = machine()
     scene = replace(scene, duration=max(scene.duration, 3 * WARM_UP * scene.period))
@@ -61,7 +71,7 @@ def time_scene(scene: Scene, steps: int = 100_000, *, progress: bool = False) ->
     run = simulate(scene, scene.make_plant(), controller, progress=progress)
     components: list[dict[str, Any]] = []
     result: dict[str, Any] = {"scene": scene.name, "components": components}
-    histogram = {}
+    histogram: dict[str, Times | dict[str, list[int]]] = {}
 
     own = _plant_times(scene.make_plant(), scene, run, steps, "plant step" if progress else None)
     components.append(own.record("plant step of the scene", run.plant, (1 / scene.plant.dt,)))
@@ -89,7 +99,12 @@ def time_scene(scene: Scene, steps: int = 100_000, *, progress: bool = False) ->
             {"iterations": int(count), **distribution(wall[calm & (iterations == count)])}
             for count in np.unique(iterations[calm])
         ]
-    result["histogram"] = {"edges_us": _BINS.tolist(), **{name: _counts(times) for name, times in histogram.items()}}
+    if in_c is not None and isinstance(controller, TrackingController):
+        result["c"] = _in_c(in_c, scene, steps, components, histogram, progress=progress)
+    result["histogram"] = {
+        "edges_us": _BINS.tolist(),
+        **{name: found if isinstance(found, dict) else _counts(found) for name, found in histogram.items()},
+    }
     result["overhead"] = call_overhead(scene.robot, run.pose)
     after = machine()
     return {**result, "machine": {**before, "load_after": after["load"]}, "versions": versions()}
@@ -118,17 +133,50 @@ def _solvers(
     return rows
 
 
+def _in_c(
+    in_c: Callable[[Scene, str, int], dict[str, Any]], scene: Scene, steps: int, components: list[dict[str, Any]],
+    histogram: dict[str, Any], *, progress: bool,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Steps in C with every QP solver; adds to ``components``, and the scene's own to ``histogram``."""
+    tuning = scene.tuning
+    if tuning is None or tuning.law != "linear_mpc":
+        return []
+    rows = []
+    for solver, name in SOLVERS.items():
+        interrupt.check()
+        own = solver == tuning.solver
+        if progress:
+            print(f"{scene.name}: C with {name} is generated, compiled and run", file=sys.stderr)
+        try:
+            found = in_c(scene, solver, max(WARM_UP + 10, round(steps * (1.0 if own else _OTHER_SOLVER))))
+        except PCRError as error:
+            rows.append({"solver": name, "missing": str(error)})
+            continue
+        for step in ("plant", "control") if own else ("control",):
+            cpu, wall = found[step][WARM_UP:].T
+            title = f"{step} step"
+            component = {"name": title, "method": f"C, {name}" if step == "control" else "C"}
+            components.append({**component, **distribution(wall), "cpu": distribution(cpu)})
+            if own:
+                histogram[f"{title} in C"] = {"no collector": _binned(1e6 * wall)}
+        rows.append({"solver": name, "worst": found["worst"]})
+    return rows
+
+
 def _tail(values: np.ndarray) -> dict[str, float]:
     p50, p99, most = np.percentile(values, [50, 99, 100]).tolist()
     return {"p50": p50, "p99": p99, "max": most}
 
 
 def _counts(times: Times) -> dict[str, list[int]]:
-    """Steps by their time, with the collector on and off; what is beyond the ends counts at the ends."""
-    us = np.clip(1e6 * times.wall[WARM_UP:], _BINS[0], _BINS[-1])
-    on = times.collecting[WARM_UP:]
-    found = {"collector on": us[on], "collector off": us[~on]}
-    return {name: np.histogram(values, _BINS)[0].tolist() for name, values in found.items()}
+    """Steps by their time, with the collector on and off."""
+    us, on = 1e6 * times.wall[WARM_UP:], times.collecting[WARM_UP:]
+    return {"collector on": _binned(us[on]), "collector off": _binned(us[~on])}
+
+
+def _binned(us: np.ndarray) -> list[int]:
+    """Counts by `_BINS`; what is beyond the ends counts at the ends."""
+    return [int(count) for count in np.histogram(np.clip(us, _BINS[0], _BINS[-1]), _BINS)[0]]
 
 
 def _plants(scene: Scene) -> list[tuple[Plant, str]]:

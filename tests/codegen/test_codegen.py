@@ -14,8 +14,10 @@ from pcr_mpc.cli import main
 from pcr_mpc.codegen.folder import write_folder
 from pcr_mpc.codegen.library import GeneratedController, build
 from pcr_mpc.codegen.scope import check_scope
+from pcr_mpc.codegen.solver import flops
 from pcr_mpc.codegen.subject import Subject
 from pcr_mpc.codegen.tables import parameters
+from pcr_mpc.codegen.timing import time_in_c, worst_case
 from pcr_mpc.control.tuning import load_tuning
 from pcr_mpc.errors import GenerationError, PCRError
 from pcr_mpc.loop.controller.make_controller import make_controller
@@ -185,6 +187,30 @@ def test_parameters_that_change_while_it_runs_do_what_retune_does(lemniscate, tm
     assert changed > 1e-5
     with pytest.raises(PCRError, match="refuses"):
         in_c.set_parameters(parameters(subject) | {"rate": np.nan})
+
+
+def test_the_longest_step_is_the_iterations_allowed_times_what_one_costs():
+    """Of the largest QP, whose iterations cost as many times more as they have more operations."""
+    subject = Subject.of_scene(replace(load_scene(SCENES / "lemniscate.toml"), duration=0.05))
+    counts = np.array([5, 5, 10, 15, 15, 20])
+    ratio = flops(subject.limited[-1], "osqp", 12) / flops(subject.rates, "osqp", 12)
+    assert ratio > 2  # what is soft counts
+    found = worst_case(subject, counts, 1e-6 * (30 + 0.4 * counts))
+    assert found["iteration_us"] == pytest.approx(0.4 * ratio)
+    assert found["rest_us"] == pytest.approx(30)
+    assert found["us"] == pytest.approx(30 + 500 * 0.4 * ratio)
+    assert worst_case(subject, counts[:2], np.full(2, 1e-5))["us"] is None
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_steps_in_c_are_timed_one_by_one(monkeypatch):
+    monkeypatch.setenv("MAKEFLAGS", f"CC={CC} CFLAGS=-O0 GRAPH_CFLAGS=-O0")
+    scene = replace(load_scene(SCENES / "lemniscate.toml"), duration=0.5)
+    found = time_in_c(scene, "osqp", 75)
+    assert (found["control"].shape, found["plant"].shape) == ((100, 2), (1000, 2))  # whole runs
+    assert (found["plant"] > 0).all()
+    assert found["worst"]["iterations"] == scene.tuning.max_iterations
 
 
 @needs_compiler

@@ -9,6 +9,7 @@ import pytest
 
 from pcr_mpc import load_scene, load_tuning
 from pcr_mpc.control.plan import Plan
+from pcr_mpc.errors import CompilerError
 from pcr_mpc.loop.controller.tracking import TrackingController
 from pcr_mpc.loop.parts.controllers import Decision
 from pcr_mpc.report.timing import timing_tables
@@ -74,6 +75,35 @@ def test_timing_in_words_has_units_budgets_and_shares(timed):
                   "relative error of F along the run", "casadi"):  # fmt: skip
         assert words in text
     assert rows["graph"].split()[-1] == "1.25"
+
+
+def test_c_stands_beside_python_or_it_is_said_why_not(scene, monkeypatch):
+    monkeypatch.setattr(timing, "_plants", lambda scene: [])
+    monkeypatch.setattr(timing, "_solvers", lambda *_: [])
+    monkeypatch.setattr(timing, "call_overhead", lambda *_: [{"name": "graph", "code": "interpreted", "us": 1.25}])
+    asked = []
+
+    def in_c(scene, solver, steps):
+        asked.append((solver, steps))
+        if solver == "daqp":
+            raise CompilerError("there is no compiler")
+        times = np.full((steps, 2), [44e-6, 55e-6])
+        worst = {"iterations": 500, "flops": 2000, "iteration_us": 0.5, "rest_us": 30.0, "us": 280.0}
+        return {"control": times, "plant": times / 4, "worst": worst}
+
+    found = timing.time_scene(scene, 200, in_c=in_c)
+    assert asked == [("osqp", 200), ("daqp", 40)]
+    times = {(one["name"], one["method"]): one for one in found["components"]}
+    control, plant = times["control step", "C, OSQP"], times["plant step", "C"]
+    assert (control["p99.9"], control["cpu"]["p50"], control["n"]) == (pytest.approx(55), pytest.approx(44), 180)
+    assert plant["cpu"]["max"] == pytest.approx(11)
+    assert sum(found["histogram"]["control step in C"]["no collector"]) == 180
+    text = timing_tables(found)
+    rows = {line.split("  ")[0].strip(): line.split() for line in text.splitlines()}
+    assert rows["control step, C, OSQP"][-6:] == ["44.0", "44.0", "44.0", "44.0", "44.0", "180"]
+    assert rows["control step, Python"][-1] == "180"
+    assert "500 iterations x 0.5 us (all soft rows, 2e+03 operations) + 30 us = 280 us" in text
+    assert "no times of C with DAQP: there is no compiler" in text
 
 
 def test_times_beyond_the_ends_count_at_the_ends(scene, monkeypatch):

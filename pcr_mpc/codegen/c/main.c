@@ -13,26 +13,47 @@
 static pcr_controller controller;
 static pcr_plant plant;
 
-static double now_us(void)
+/* When something began, and then how long it took: CPU time and wall time [us]. */
+typedef struct {
+    double cpu, wall;
+} took;
+
+static double now_us(clockid_t clock)
 {
     struct timespec t;
-    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+    clock_gettime(clock, &t);
     return 1e6 * (double)t.tv_sec + 1e-3 * (double)t.tv_nsec;
+}
+
+static took begin(void)
+{
+    took now;
+    now.cpu = now_us(CLOCK_THREAD_CPUTIME_ID);
+    now.wall = now_us(CLOCK_MONOTONIC);
+    return now;
+}
+
+static took end(took began)
+{
+    took since;
+    since.wall = now_us(CLOCK_MONOTONIC) - began.wall;
+    since.cpu = now_us(CLOCK_THREAD_CPUTIME_ID) - began.cpu;
+    return since;
 }
 
 static int by_size(const void *a, const void *b)
 {
-    const double x = *(const double *)a, y = *(const double *)b;
+    const double x = ((const took *)a)->cpu, y = ((const took *)b)->cpu;
     return (x > y) - (x < y);
 }
 
-static void show(const char *name, double *times, int count)
+static void show(const char *name, took *times, int count)
 {
     static const double shares[] = {0.5, 0.95, 0.99, 0.999, 1.0};
     qsort(times, (size_t)count, sizeof *times, by_size);
     printf("%-14s", name);
     for (int i = 0; i < 5; i++) {
-        printf("%10.2f", times[(int)(shares[i] * (count - 1))]);
+        printf("%10.2f", times[(int)(shares[i] * (count - 1))].cpu);
     }
     printf("%10d\n", count);
 }
@@ -57,7 +78,7 @@ static void measure(int k, pcr_measurement *measured)
 }
 
 /* One run of the scene; times of control steps and plant steps are added to those that are there. */
-static int run(double *control, double *steps, double *square, double *away, int *others)
+static int run(took *control, took *steps, double *square, double *away, int *others)
 {
     double on_the_way[PCR_REAL_DELAY + 1][PCR_N] = {{0.0}};
     pcr_measurement measured;
@@ -71,9 +92,9 @@ static int run(double *control, double *steps, double *square, double *away, int
     *others = 0;
     for (int k = 0, step = 0; k < PCR_PERIODS; k++) {
         measure(k, &measured);
-        double began = now_us();
+        took began = begin();
         const pcr_result result = pcr_controller_step(&controller, &measured, &output);
-        control[k] = now_us() - began;
+        control[k] = end(began);
         if (result != PCR_OK) {
             printf("control step %d: result %d\n", k, (int)result);
             return 1;
@@ -87,9 +108,9 @@ static int run(double *control, double *steps, double *square, double *away, int
             if (pcr_vector_payload[step] != plant.payload && pcr_plant_carry(&plant, pcr_vector_payload[step])) {
                 return 1;
             }
-            began = now_us();
+            began = begin();
             const pcr_result moved = pcr_plant_step(&plant, on_the_way[0], pcr_vector_force);
-            steps[step] = now_us() - began;
+            steps[step] = end(began);
             if (moved != PCR_OK) {
                 printf("plant step %d: result %d\n", step, (int)moved);
                 return 1;
@@ -130,23 +151,36 @@ static int replay(double *away, int *others)
 }
 
 /* Of each period its shortest time in all runs, which do the same: what is left is the work, not the computer's others. */
-static void least_of(const double *times, int runs, double *least)
+static void least_of(const took *times, int runs, took *least)
 {
     for (int k = 0; k < PCR_PERIODS; k++) {
         least[k] = times[k];
         for (int i = 1; i < runs; i++) {
-            least[k] = fmin(least[k], times[i * PCR_PERIODS + k]);
+            least[k].cpu = fmin(least[k].cpu, times[i * PCR_PERIODS + k].cpu);
         }
     }
 }
 
+/* For programs: all times in the order in which they were measured, [cpu, wall] of each control step, then of each plant
+   step, as doubles. */
+static int kept(const char *path, const took *control, size_t periods, const took *steps, size_t count)
+{
+    FILE *file = fopen(path, "wb");
+    if (file == NULL) {
+        return 0;
+    }
+    const int written = fwrite(control, sizeof *control, periods, file) == periods
+                        && fwrite(steps, sizeof *steps, count, file) == count;
+    return fclose(file) == 0 && written;
+}
+
 int main(int count, char **words)
 {
-    /* ./example 100000: so many control steps are timed, in as many runs as that takes. */
+    /* ./example 100000 FILE: so many control steps are timed, in as many runs as that takes, and their times written. */
     const int wanted = count > 1 ? atoi(words[1]) : PCR_PERIODS, runs = (wanted + PCR_PERIODS - 1) / PCR_PERIODS;
     const int periods = runs * PCR_PERIODS, per = PCR_STEPS_A_PERIOD;
-    double *control = malloc(sizeof *control * (size_t)periods);
-    double *steps = malloc(sizeof *steps * (size_t)(periods * per));
+    took *control = malloc(sizeof *control * (size_t)periods);
+    took *steps = malloc(sizeof *steps * (size_t)(periods * per));
     double square = 0.0, away = 0.0, replayed = 0.0;
     int others = 0, other_rungs = 0, failed = control == NULL || steps == NULL || runs < 1;
     for (int i = 0; i < runs && !failed; i++) {
@@ -163,7 +197,11 @@ int main(int count, char **words)
            others, PCR_PERIODS);
     printf("rates, same measurements    differ by at most %.2g rad/s, rung or iterations in %d of %d periods\n",
            replayed, other_rungs, PCR_PERIODS);
-    static double least[PCR_PERIODS];
+    if (count > 2 && !kept(words[2], control, (size_t)periods, steps, (size_t)(periods * per))) {
+        printf("cannot write %s\n", words[2]);
+        return 1;
+    }
+    static took least[PCR_PERIODS];
     least_of(control, runs, least);
     printf("\nCPU time [us]        p50       p95       p99     p99.9       max     steps\n");
     show("control step", control, periods);
