@@ -10,7 +10,7 @@ import casadi as ca
 from ..buffered import building
 from ..control.condensing import checking
 from ..control.mpc import LinearMPC
-from ..linearisation.model_graph import force_graph
+from ..linearisation.strain_watch import strain_graphs
 from ..loop.parts.foresight_graph import Places, foresight_graph
 from ..plant.motion.plant import Plant
 from ..plant.motion.step_graph import StepModel, step_graph
@@ -44,13 +44,15 @@ class Graphs:
 
 
 @building
-def make_graphs(model: StepModel, target: StepModel, places: Places, law: LinearMPC, plant: Plant) -> Graphs:
+def make_graphs(
+    model: StepModel, target: StepModel, watched: StepModel, places: Places, law: LinearMPC, plant: Plant
+) -> Graphs:
     """Put together the C of a controller's graphs and of a plant's.
 
     Parameters
     ----------
-    model, target : StepModel
-        Of the controller's model, and of the rods that carry the observed force.
+    model, target, watched : StepModel
+        Of the controller's model, of the rods that carry the observed force, and of those whose limits are watched.
     places : Places
         Of the controller.
     law : LinearMPC
@@ -67,11 +69,20 @@ def make_graphs(model: StepModel, target: StepModel, places: Places, law: Linear
         "finish": _rods(model, 1, "finish"),
         "target_follow": _rods(target, 2, "target_follow"),
         "target_finish": _rods(target, 1, "target_finish"),
+        "watch_follow": _rods(watched, 2, "watch_follow"),
+        "watch_finish": _rods(watched, 1, "watch_finish"),
         "plant_once": _called(steps[0], "plant_once"),
         "plant_twice": _called(steps[1], "plant_twice"),
         "determinant": _called(elastica.tip_determinant(), "determinant"),
         "curvature": _called(elastica.rod_curvature(inline=False), "curvature"),
     }
+    if watched.kind.layout is not None:
+        strain = strain_graphs(watched.kind, watched.method.newton.size1_in(0) // 4)
+        functions |= {
+            "strain_nodes": _called(strain.nodes, "strain_nodes"),
+            "strain_along": _called(strain.along, "strain_along"),
+            "strain_there": _called(strain.there, "strain_there"),
+        }
     generator = ca.CodeGenerator("pcr_graphs.c", {"casadi_int": "int"})
     for function in functions.values():
         generator.add(function)
@@ -85,15 +96,13 @@ def _entry(name: str, function: str) -> str:
 
 
 def _rods(model: StepModel, iterations: int, name: str) -> Any:
-    """`warm_calls` of the rods of a plant, whose result is all that weighs on it."""
+    """`warm_calls` of the rods of a plant, with their weight where they bend under it."""
     kind = model.kind
     target, vector = ca.MX.sym("target", 2 + kind.n_rods), ca.MX.sym("numbers", kind.size)
     memory = ca.MX.sym("memory", model.widths[0])
-    if model.weight == "none":
-        results = warm_calls(kind, model.method, iterations)(target, memory, kind.weightless(vector))
-        return ca.Function(name, [target, memory, vector], list(results))
-    record, verdict, force, k, g = force_graph(model, iterations)(target, memory, vector)
-    return ca.Function(name, [target, memory, vector], [record, verdict, ca.vertcat(force, ca.vec(k), ca.vec(g))])
+    numbers = vector if model.weight == "exact" else kind.weightless(vector)
+    results = warm_calls(kind, model.method, iterations)(target, memory, numbers)
+    return ca.Function(name, [target, memory, vector], list(results))
 
 
 def _called(function: Any, name: str) -> Any:

@@ -31,11 +31,6 @@ def check_scope(scene: Scene, tuning: Tuning | None) -> Tuning:
     if scene.trajectory is None or tuning is None:
         raise GenerationError(f"{scene.name}: there is nothing to track, so there is no controller to generate; "
                               "give a scene with a [reference] and a tuning", part="reference")  # fmt: skip
-    robot = scene.robot.plain() if scene.plant.rods == "plain" else scene.robot
-    for which, reason in (("controller", scene.robot.needs_shooting), ("plant", robot.weightless().needs_shooting)):
-        if reason is not None:
-            raise GenerationError(f"{scene.name}: C has rods in closed form only yet, and {reason}; take a {which} of "
-                                  "plain rods without weight", part=f"rods of the {which}")  # fmt: skip
     for part, found, known, advice in _choices(scene, tuning):
         if found not in known:
             named = ", ".join(map(str, known))
@@ -50,7 +45,7 @@ def check_scope(scene: Scene, tuning: Tuning | None) -> Tuning:
 
 
 def _choices(scene: Scene, tuning: Tuning) -> list[tuple[str, Any, tuple[Any, ...], str]]:
-    model, plant = tuning.model, scene.plant
+    plant = scene.plant
     other = "give another tuning by --controller"
     carrying = "none" if scene.payload is None or plant.payload == "ignored" else plant.inertia
     return [
@@ -58,8 +53,7 @@ def _choices(scene: Scene, tuning: Tuning) -> list[tuple[str, Any, tuple[Any, ..
         ("fallback", tuning.fallback, ("ladder",), other),
         ("observer that adapts", tuning.observer.adapts if tuning.observer else (), ((),), "leave out observer.adapts"),
         ("learning", tuning.learning, (None,), "leave [learning] out of the tuning"),
-        ("method of the controller's rods", model.method, ("closed_form",), other),
-        ("method of the plant's rods", plant.method, ("closed_form",), "set [plant] method"),
+        ("method of the plant's rods", plant.method, ("closed_form", "multiple_shooting"), "set [plant] method"),
         ("inertia of the plant", plant.inertia, ("none", "constant", "condensed"), "set [plant] inertia"),
         ("plant that carries a payload with inertia", carrying, ("none", "constant"), "set [plant] inertia"),
         ("snapping plant", plant.on_snap, ("raise",), "set [plant] on_snap"),

@@ -17,6 +17,7 @@ from ..loop.controller.tracking import TrackingController
 from ..loop.parts.assembled import resting_model, resting_state
 from ..loop.scene.scene import Scene
 from ..plant.motion.plant import Plant
+from ..plant.motion.step_graph import StepModel
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from .graphs import Graphs, make_graphs
@@ -98,7 +99,14 @@ class Subject:
     def graphs(self) -> Graphs:
         """C of all graphs."""
         model, target = self.work.foresight.step_models
-        return make_graphs(model, target, self.work.foresight.places, self.law, self.plant)
+        return make_graphs(model, target, self.watched, self.work.foresight.places, self.law, self.plant)
+
+    @property
+    def watched(self) -> StepModel:
+        """Of the rods whose limits are watched."""
+        model = self.work.watch.plant.step_model
+        assert model is not None
+        return model
 
     @cached_property
     def rates(self) -> Shape:
@@ -109,6 +117,14 @@ class Subject:
     def limited(self) -> list[Shape]:
         """Of the QPs with soft rows, by the bits of the kinds that are near."""
         return limited_shapes(self.tuning.horizon, self.robot.n_rods, list(self.kinds.values()))
+
+    @property
+    def plant_as_model(self) -> bool:
+        """Whether the plant's rods, which have no mass then, are those of the model: C can follow them elsewhere."""
+        plant, (model, _) = self.plant.step_model, self.work.foresight.step_models
+        assert plant is not None
+        alike = (plant.kind, plant.method, plant.weight) == (model.kind, model.method, model.weight)
+        return alike and plant.inertia == "none" and plant.weight != "condensed"
 
     def resting(self) -> Any:
         """Linear model about the start, and the gain of the LQR of the terminal weight."""

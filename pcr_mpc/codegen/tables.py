@@ -12,9 +12,12 @@ from ..control.limited_qp import PENALTY
 from ..control.qp import stage_weights
 from ..errors import GenerationError
 from ..linearisation.model_graph import sizes
+from ..linearisation.strain_watch import strain_graphs
 from ..loop.parts.assembled import tip_noise
+from ..plant.motion.step_graph import StepModel
 from ..plant.motion.step_graph import limits as step_limits
 from ..plant.rods.chart import critical_load_table
+from ..plant.rods.numbers import Kind
 from .ctext import array, block, defines, number, structure
 from .solver import Shape, daqp_room
 from .subject import KIND_BITS, Subject
@@ -41,11 +44,13 @@ def config(subject: Subject) -> str:
     """Text of ``pcr_config.h``."""
     scene, tuning, work, graphs = subject.scene, subject.tuning, subject.work, subject.graphs
     n, horizon, places = subject.robot.n_rods, tuning.horizon, work.foresight.places
-    model, target = work.foresight.step_models
+    (model, target), watched = work.foresight.step_models, subject.watched
     foresight, check = graphs.functions["foresight"], graphs.functions["check"]
     reference, _, payloads = subject.reference()
     rooms = graphs.room(*(name for name in graphs.functions if not name.startswith("plant")))
     plant_rooms = graphs.room("plant_once", "plant_twice", "follow", "finish")
+    of_plant = subject.plant.step_model
+    assert of_plant is not None
     kinds = subject.kinds
     largest = subject.limited[-1]
     columns, rows, _, of_a, _ = largest.sizes
@@ -63,9 +68,20 @@ def config(subject: Subject) -> str:
         "PCR_MODEL": sizes(model).model,
         "PCR_RECORD": sizes(model).record,
         "PCR_TARGET": sizes(target).record,
+        "PCR_WIDTH": _width(model),
+        "PCR_TARGET_WIDTH": _width(target),
+        "PCR_WATCH_WIDTH": _width(watched),
+        "PCR_LARGEST_RECORD": max(sizes(one).record for one in (model, target, watched)),
+        "PCR_FOLLOWING": model.method.following,
+        "PCR_TARGET_FOLLOWING": target.method.following,
+        "PCR_WATCH_FOLLOWING": watched.method.following,
+        "PCR_WATCH_FOLLOWS": int(work.watch.follows_model),
+        "PCR_WATCH_SHOT": int(watched.kind.layout is not None),
+        "PCR_WATCH_RECORD": sizes(watched).record,
+        "PCR_WATCH_NUMBERS": watched.kind.size,
+        "PCR_TARGET_NUMBERS": target.kind.size,
         "PCR_NUMBERS": model.kind.size,
         "PCR_ROD_NUMBERS": model.kind.names.index("rods[1].bending_stiffness"),
-        "PCR_TIP_MASS": model.kind.names.index("tip_mass"),
         "PCR_PERIOD": float(scene.period),
         "PCR_PERIODS": scene.n_periods,
         "PCR_PLANT_STEP": float(subject.plant.dt),
@@ -103,9 +119,18 @@ def config(subject: Subject) -> str:
         "PCR_RATES_A": subject.rates.matrix.nnz,
         "PCR_RATES_DOUBLES": _room(subject, subject.rates)[0],
         "PCR_RATES_INTS": _room(subject, subject.rates)[1],
-        "PCR_PLANT_MEMORY": sum(subject.plant.step_model.widths) if subject.plant.step_model else 0,
-        "PCR_PLANT_MASSLESS": int(subject.plant.inertia == "none" and subject.plant.weight == "none"),
-    }
+        "PCR_PLANT_MEMORY": sum(of_plant.widths),
+        "PCR_PLANT_MASSLESS": int(of_plant.inertia == "none"),
+        # Then the model's rods, followed to another pose, say what the plant's are there.
+        "PCR_PLANT_AS_MODEL": int(subject.plant_as_model),
+        "PCR_PLANT_NUMBERS": of_plant.kind.size,
+        "PCR_PLANT_TIP_MASS": of_plant.kind.names.index("tip_mass"),
+        "PCR_PLANT_START": of_plant.widths[0],
+    }  # fmt: skip
+    values["PCR_PHYSICS"] = watched.kind.layout.size if watched.kind.layout is not None else 0
+    if watched.kind.layout is not None:
+        strain = strain_graphs(watched.kind, _width(watched) // 4)
+        values |= {"PCR_STRAIN_POINTS": strain.points, "PCR_STRAIN_INTERVALS": strain.intervals}  # fmt: skip
     values["PCR_PLANT_CONSTANT"] = int(subject.plant.inertia == "constant")
     values |= {f"PCR_{part.upper()}": size for part, size in rooms.items()}
     values |= {f"PCR_PLANT_{part.upper()}": size for part, size in plant_rooms.items()}
@@ -124,6 +149,16 @@ def config(subject: Subject) -> str:
         f"/* Sizes and settings of the controller {tuning.name!r} of the scene {scene.name!r}. */\n"
         f"#ifndef PCR_CONFIG_H\n#define PCR_CONFIG_H\n\n{defines(values)}\n#endif\n"
     )
+
+
+def _width(model: StepModel) -> int:
+    """Unknowns of a rod."""
+    return int(model.method.newton.size1_in(0))
+
+
+def _among(numbers: Kind, model: Kind) -> np.ndarray:
+    """Where each number of one kind is among those of another; -1: nowhere."""
+    return np.array([model.names.index(name) if name in model.names else -1 for name in numbers.names])
 
 
 def parameters(subject: Subject) -> dict[str, np.ndarray | float]:
@@ -165,7 +200,8 @@ def tables(subject: Subject) -> str:
     record = work.foresight.rows["records"][0]
     rows, loads = critical_load_table()
     ratios = np.array([rod.thickness_ratio or math.nan for rod in robot.rods])
-    kinds = list(subject.kinds)
+    kinds, (of_model, target) = list(subject.kinds), work.foresight.step_models
+    model_kind = of_model.kind
     texts = [
         f"/* Numbers of the scene {subject.scene.name!r} and of its controller {subject.tuning.name!r}. */\n"
         '#include "pcr_tables.h"\n\n#include <math.h>\n#include <stddef.h>\n',
@@ -174,6 +210,12 @@ def tables(subject: Subject) -> str:
         structure("pcr_pose", "pcr_scene_pose", [block(pose.p), block(pose.q)]),
         array("double", "pcr_scene_record", record),
         array("double", "pcr_scene_target_record", given["target"]),
+        array("double", "pcr_scene_watch_record", work.watch.plant.record),
+        array("double", "pcr_scene_watch_result", work.watch.plant.rods(pose.p, pose.q).result),
+        array("double", "pcr_scene_target_numbers", given["target_numbers"]),
+        array("double", "pcr_scene_watch_numbers", work.watch.plant.numbers),
+        array("int", "pcr_target_places", _among(target.kind, model_kind)),
+        array("int", "pcr_watch_places", _among(subject.watched.kind, model_kind)),
         array("double", "pcr_scene_model", column),
         array("double", "pcr_scene_mass", given["mass"].ravel(order="F")),
         array("double", "pcr_scene_memory", plant.memory(x)),

@@ -123,6 +123,11 @@ class LimitWatch(Remade):
             for some in itertools.combinations(self._present, count)
         ]
 
+    @property
+    def plant(self) -> Plant:
+        """Whose rods are asked."""
+        return self._plant
+
     def reset(self, x: np.ndarray, pose: Equilibrium) -> None:
         """Follow the branch of ``pose`` from state x."""
         self._plant.reset(x, pose)

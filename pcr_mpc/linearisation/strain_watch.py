@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -12,8 +13,9 @@ from ..buffered import BufferedFunction, graph_cache
 from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.rods.equations import Layout, RodPhysics, aligned_steps, interpolated, propagation, unpacked
+from ..plant.rods.numbers import Kind
 from ..plant.rods.physics import robot_physics
-from ..plant.rods.strain import largest_strain, quarter_period
+from ..plant.rods.strain import largest_strain, quarter_period, strain_points
 from ..plant.statics.state import RobotState
 from .linear_limits import Rows
 
@@ -118,6 +120,57 @@ def _node_graph(layout: Layout, count: int) -> Any:
     nodes, physics, ratio = ca.SX.sym("nodes", 4, count), ca.SX.sym("physics", layout.size), ca.SX.sym("ratio")
     found = [_strain(layout, physics, nodes[:, j], j / count, ratio) for j in range(count)]
     return ca.Function("strains", [nodes, physics, ratio], [ca.norm_inf(ca.vertcat(*found))], {"cse": True})
+
+
+@dataclass(frozen=True)
+class StrainGraphs:
+    """What `StrainWatch` does for rods that are shot, as graphs, for a caller without Python.
+
+    Attributes
+    ----------
+    nodes : casadi.Function
+        (nodes of all rods, rod after rod, numbers of the robot, half thickness over length (n)) -> largest strain at a
+        node (n), numbers of each rod (s, n) as its graphs take them.
+    along : casadi.Function
+        (nodes (4, N), numbers of the rod, half thickness over length) -> strain at evenly spaced points, ends included.
+    there : casadi.Function
+        (node (4), arc length from it, its s, numbers of the rod, half thickness over length) -> strain, its gradient.
+    points, intervals : int
+        Pieces between the points of ``along``, and between knots of the rods' properties.
+    """
+
+    nodes: Any
+    along: Any
+    there: Any
+    points: int
+    intervals: int
+
+
+def strain_graphs(kind: Kind, count: int) -> StrainGraphs:
+    """Build the graphs for robots of a kind whose rods have ``count`` nodes each."""
+    layout, n = kind.layout, kind.n_rods
+    assert layout is not None
+    unknowns, vector, ratios = ca.MX.sym("unknowns", 4 * count, n), ca.MX.sym("numbers", kind.size), ca.MX.sym("r", n)
+    physics = [ca.vertcat(*rod.physics) for rod in kind.unpack(vector).rods]
+    at_node = _node_graph(layout, count)
+    coarse = [at_node(ca.reshape(unknowns[:, i], 4, count), physics[i], ratios[i]) for i in range(n)]
+    results = [ca.vertcat(*coarse), ca.horzcat(*physics)]
+    points = strain_points(layout)
+    s = np.linspace(0.0, 1.0, points + 1)
+    piece = np.minimum((s * count).astype(int), count - 1)
+    steps = aligned_steps(layout, count, max(4, 32 // count))
+    nodes, of_rod, ratio = ca.MX.sym("nodes", 4, count), ca.MX.sym("physics", layout.size), ca.MX.sym("ratio")
+    one = _strain_graph(layout, steps)
+    arguments = (nodes[:, piece.tolist()], ca.DM(s - piece / count).T, ca.DM(piece / count).T,
+                 ca.repmat(of_rod, 1, points + 1), ca.repmat(ratio, 1, points + 1))  # fmt: skip
+    along = one.map(points + 1)(*arguments)[0]
+    return StrainGraphs(
+        nodes=ca.Function("strain_nodes", [unknowns, vector, ratios], results),
+        along=ca.Function("strain_along", [nodes, of_rod, ratio], [along.T]),
+        there=_strain_graph(layout, aligned_steps(layout, count, _STEPS)),
+        points=points,
+        intervals=max(1, layout.intervals),
+    )
 
 
 def _strain(layout: Layout, physics: Any, state: Any, s: Any, ratio: Any) -> Any:

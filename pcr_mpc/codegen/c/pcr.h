@@ -20,7 +20,8 @@ typedef enum {
     PCR_NOT_STARTED = 1,       /* call pcr_controller_init or pcr_plant_init first */
     PCR_ARGUMENT = 2,          /* a number is not finite, or an array is missing */
     PCR_FIRST_MEASUREMENT = 3, /* the very first measurement is in other units: degrees, millimetres, whole turns off */
-    PCR_OUT_OF_REACH = 4       /* the rods cannot follow to that pose from where they are: plant and start only */
+    PCR_OUT_OF_REACH = 4,      /* the rods cannot follow to that pose from where they are: plant and start only */
+    PCR_NOT_HERE = 5           /* pcr_plant_init and pcr_plant_set_numbers, of a plant that knows only its start */
 } pcr_result;
 
 /* Which rung of the ladder has answered. */
@@ -137,6 +138,8 @@ typedef struct {
     double before[PCR_N];                                   /* angles that were believed last */
     double on_the_way[PCR_DELAY + 1][PCR_N], u[PCR_N], turning[PCR_N];
     double predicts[PCR_MODEL];
+    double watch_numbers[PCR_WATCH_NUMBERS], watch_at[2 + PCR_N];               /* rods whose limits are watched */
+    double watch_record[PCR_WATCH_RECORD], watch_result[6 + 2 * PCR_N];
     int has_plan, has_states, has_models, age;              /* of the last plan; age in periods, -1 beyond all */
     double inputs[PCR_HORIZON][PCR_N], states[PCR_HORIZON + 1][PCR_STATES], models[PCR_MODELS * PCR_MODEL];
     int has_problem, limits_matter;
@@ -150,7 +153,7 @@ typedef struct {
 typedef struct {
     int started, corrections; /* Newton iterations of the last step */
     double x[PCR_STATES];     /* [p, v, q] in [m, m/s, rad] */
-    double memory[PCR_PLANT_MEMORY], next[PCR_PLANT_MEMORY], numbers[PCR_NUMBERS];
+    double memory[PCR_PLANT_MEMORY], next[PCR_PLANT_MEMORY], numbers[PCR_PLANT_NUMBERS];
     double tip_mass, payload; /* of the empty tip, and what it carries [kg]; change it by pcr_plant_carry */
     double w[PCR_PLANT_W];
     const double *arg[PCR_PLANT_ARG];
@@ -171,7 +174,8 @@ pcr_result pcr_controller_set_parameters(pcr_controller *controller, const pcr_p
    the only way to use a copy. */
 pcr_result pcr_controller_restore(pcr_controller *controller, const pcr_controller *saved);
 
-/* Put the plant at rest in a pose; NULL: where the scene starts. */
+/* Put the plant at rest in a pose; NULL: where the scene starts. Of rods that have inertia, or that the controller's
+   model solves in another way, nothing else is known. */
 pcr_result pcr_plant_init(pcr_plant *plant, const pcr_pose *pose);
 
 /* Advance by PCR_PLANT_STEP with the motor rates u held and a force on the tip [N] besides its weight (NULL: none).
@@ -181,8 +185,8 @@ pcr_result pcr_plant_step(pcr_plant *plant, const double *u, const double *force
 /* Let the tip carry a payload [kg]: the momentum of what is picked up at rest stays. */
 pcr_result pcr_plant_carry(pcr_plant *plant, double payload);
 
-/* Let the robot have other numbers, as listed in README.md, in the same state; of a plant whose rods have no mass. Where
-   it returns PCR_OUT_OF_REACH the plant is as it was. */
+/* Let the robot have other numbers, as listed in README.md, in the same state; of the plants that pcr_plant_init knows
+   elsewhere. Where it returns PCR_OUT_OF_REACH the plant is as it was. */
 pcr_result pcr_plant_set_numbers(pcr_plant *plant, const double *numbers);
 
 /* PCR_OK if the plant has a state, which is in plant->x. */

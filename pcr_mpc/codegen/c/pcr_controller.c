@@ -65,8 +65,7 @@ static int bring_along(pcr_controller *c)
         if (good[j] < 1.0) {
             double x[PCR_STATES], *record = c->in + PCR_IN_RECORDS + j * PCR_RECORD;
             memcpy(x, c->out + PCR_OUT_PLACES + j * PCR_STATES, sizeof x);
-            if (pcr_follow(pcr_graph_follow, pcr_graph_finish, c->parameters.numbers, x, x + 4, 1e-6, record, result,
-                           room_of(c))) {
+            if (pcr_follow(&pcr_model_rods, c->parameters.numbers, x, x + 4, 1e-6, record, result, room_of(c))) {
                 return 1;
             }
             foresee(c);
@@ -81,8 +80,8 @@ static int bring_along(pcr_controller *c)
         for (int i = 0; i < PCR_N; i++) {
             q[i] = end[4 + i] + shift[i];
         }
-        if (!pcr_follow(pcr_graph_target_follow, pcr_graph_target_finish, c->in + PCR_IN_TARGET_NUMBERS, end, q, 1e-2,
-                        c->in + PCR_IN_TARGET, result, room_of(c))) {
+        if (!pcr_follow(&pcr_target_rods, c->in + PCR_IN_TARGET_NUMBERS, end, q, 1e-2, c->in + PCR_IN_TARGET, result,
+                        room_of(c))) {
             foresee(c);
         }
     }
@@ -94,7 +93,15 @@ static void write_parameters(pcr_controller *c)
     const pcr_parameters *of = &c->parameters;
     double *in = c->in, *check = c->check_in;
     memcpy(in + PCR_IN_NUMBERS, of->numbers, sizeof of->numbers);
-    memcpy(in + PCR_IN_TARGET_NUMBERS, of->numbers, sizeof of->numbers);
+    /* Rods that are solved in another way have other numbers besides. */
+    for (int i = 0; i < PCR_TARGET_NUMBERS; i++) {
+        const int at = pcr_target_places[i];
+        in[PCR_IN_TARGET_NUMBERS + i] = at < 0 ? pcr_scene_target_numbers[i] : of->numbers[at];
+    }
+    for (int i = 0; i < PCR_WATCH_NUMBERS; i++) {
+        const int at = pcr_watch_places[i];
+        c->watch_numbers[i] = at < 0 ? pcr_scene_watch_numbers[i] : of->numbers[at];
+    }
     memcpy(in + PCR_IN_WEIGHTS, of->weights, sizeof of->weights);
     memcpy(in + PCR_IN_TERMINAL, of->terminal, sizeof of->terminal);
     memcpy(in + PCR_IN_GAIN, of->observer_gain, sizeof of->observer_gain);
@@ -154,11 +161,16 @@ pcr_result pcr_controller_init(pcr_controller *c, const pcr_pose *pose)
     memcpy(target, pcr_scene_target_record, sizeof pcr_scene_target_record);
     memcpy(c->predicts, pcr_scene_model, sizeof pcr_scene_model);
     memcpy(c->in + PCR_IN_MASS, pcr_scene_mass, sizeof pcr_scene_mass);
+    write_parameters(c);
+    memcpy(c->watch_record, pcr_scene_watch_record, sizeof pcr_scene_watch_record);
+    memcpy(c->watch_result, pcr_scene_watch_result, sizeof pcr_scene_watch_result);
+    memcpy(c->watch_at, at->p, sizeof at->p);
+    memcpy(c->watch_at + 2, at->q, sizeof at->q);
     if (pose != NULL) {
-        if (pcr_follow(pcr_graph_follow, pcr_graph_finish, c->parameters.numbers, at->p, at->q, 1e-6, record, result,
-                       room_of(c))
-            || pcr_follow(pcr_graph_target_follow, pcr_graph_target_finish, c->parameters.numbers, at->p, at->q, 1e-6,
-                          target, result, room_of(c))) {
+        if (pcr_follow(&pcr_model_rods, c->parameters.numbers, at->p, at->q, 1e-6, record, result, room_of(c))
+            || pcr_follow(&pcr_target_rods, c->in + PCR_IN_TARGET_NUMBERS, at->p, at->q, 1e-6, target, result, room_of(c))
+            || pcr_follow(&pcr_watch_rods, c->watch_numbers, at->p, at->q, 1e-6, c->watch_record,
+                          c->watch_result, room_of(c))) {
             return PCR_OUT_OF_REACH;
         }
         /* The linear model at rest, about this pose. */
@@ -174,7 +186,6 @@ pcr_result pcr_controller_init(pcr_controller *c, const pcr_pose *pose)
         memcpy(record + j * PCR_RECORD, record, PCR_RECORD * sizeof *record);
     }
     memcpy(c->in + PCR_IN_RECKONED, at->q, sizeof at->q);
-    write_parameters(c);
     pcr_gate_start(c, at->q);
     pcr_law_reset(c);
     c->started = 1;

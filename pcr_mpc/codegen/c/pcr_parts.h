@@ -9,13 +9,13 @@
 extern "C" {
 #endif
 
-/* Parts of a record of the rods' pose; what a warm start needs comes first. */
-#define PCR_WIDTH 3
+/* Parts of a record of the rods' pose, whose rods have so many unknowns each; what a warm start needs comes first. */
 #define PCR_UNKNOWNS 0
-#define PCR_TANGENTS (PCR_WIDTH * PCR_N)
-#define PCR_POSES (4 * PCR_WIDTH * PCR_N)
-#define PCR_LOADS ((4 * PCR_WIDTH + 3) * PCR_N)
-#define PCR_LOAD_TANGENTS ((4 * PCR_WIDTH + 6) * PCR_N)
+#define PCR_TANGENTS(width) ((width) * PCR_N)
+#define PCR_POSES(width) (4 * (width) * PCR_N)
+#define PCR_LOADS(width) ((4 * (width) + 3) * PCR_N)
+#define PCR_LOAD_TANGENTS(width) ((4 * (width) + 6) * PCR_N)
+#define PCR_RECORD_OF(width) ((4 * (width) + 20) * PCR_N)
 #define PCR_RESULT (6 + 2 * PCR_N)  /* F, K, G */
 
 /* pcr_motors.c: rates nearest to u that keep all limits of the motors now and ever after. `reckoned` is another
@@ -30,8 +30,8 @@ int pcr_met(const pcr_controller *controller, const double *u, const double *pre
 void pcr_gate_start(pcr_controller *controller, const double *q);
 pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measured, int *doubts);
 
-/* pcr_rods.c: follow the rods from `record` to another pose. `twice` and `once` are graphs that take two Newton
-   iterations or one. Returns 0 if they followed: `record` and `result` are then of that pose. */
+/* pcr_rods.c: follow the rods from `record` to another pose. Returns 0 if they followed: `record` and `result` are then
+   of that pose. `derivatives` is the residual at which derivatives may be taken. */
 typedef int pcr_graph(const double **arg, double **res, int *iw, double *w);
 typedef struct {
     const double **arg;
@@ -39,10 +39,14 @@ typedef struct {
     int *iw;
     double *w;
 } pcr_room;
-int pcr_climb(pcr_graph *first, pcr_graph *once, const double *numbers, const double *p, const double *q,
-              double derivatives, double *record, double *result, pcr_room room);
-int pcr_follow(pcr_graph *twice, pcr_graph *once, const double *numbers, const double *p, const double *q,
-               double derivatives, double *record, double *result, pcr_room room);
+typedef struct {
+    pcr_graph *twice, *once; /* take two Newton iterations or one */
+    int width;               /* unknowns of a rod */
+    double following;        /* residual that will do */
+} pcr_rods;
+extern const pcr_rods pcr_model_rods, pcr_target_rods, pcr_watch_rods;
+int pcr_follow(const pcr_rods *rods, const double *numbers, const double *p, const double *q, double derivatives,
+               double *record, double *result, pcr_room room);
 
 /* pcr_pose.c: limits of the pose ahead that are near. Returns 0 if the rods could follow to it. */
 int pcr_near(pcr_controller *controller, pcr_pose_limits *limits);

@@ -17,11 +17,11 @@ static int bring(pcr_plant *plant, const double *numbers, double *record)
     room.res = plant->res;
     room.iw = plant->iw;
     room.w = plant->w;
-    if (pcr_follow(pcr_graph_follow, pcr_graph_finish, numbers, plant->x, plant->x + 4, 1e-6, record, result, room)) {
+    if (pcr_follow(&pcr_model_rods, numbers, plant->x, plant->x + 4, 1e-6, record, result, room)) {
         return 1;
     }
-    memcpy(plant->memory, record, PCR_LOADS * sizeof *record);
-    memcpy(plant->memory + PCR_LOADS, result, 2 * sizeof *result);
+    memcpy(plant->memory, record, PCR_PLANT_START * sizeof *record);
+    memcpy(plant->memory + PCR_PLANT_START, result, 2 * sizeof *result);
     return 0;
 }
 
@@ -37,15 +37,18 @@ pcr_result pcr_plant_init(pcr_plant *plant, const pcr_pose *pose)
     memcpy(plant->numbers, pcr_scene_plant_numbers, sizeof plant->numbers);
     memcpy(plant->x, at->p, sizeof at->p);
     memcpy(plant->x + 4, at->q, sizeof at->q);
-    plant->tip_mass = plant->numbers[PCR_TIP_MASS];
+    plant->tip_mass = plant->numbers[PCR_PLANT_TIP_MASS];
     if (pose != NULL) {
         for (int i = 0; i < PCR_STATES; i++) {
             if (!isfinite(plant->x[i])) {
                 return PCR_ARGUMENT;
             }
         }
+        if (!PCR_PLANT_AS_MODEL) {
+            return PCR_NOT_HERE;
+        }
         memcpy(record, pcr_scene_record, sizeof record);
-        if (!PCR_PLANT_MASSLESS || bring(plant, plant->numbers, record)) {
+        if (bring(plant, plant->numbers, record)) {
             return PCR_OUT_OF_REACH;
         }
     }
@@ -55,28 +58,31 @@ pcr_result pcr_plant_init(pcr_plant *plant, const pcr_pose *pose)
 
 pcr_result pcr_plant_set_numbers(pcr_plant *plant, const double *numbers)
 {
-    double record[PCR_RECORD] = {0.0}, all[PCR_NUMBERS];
+    double record[PCR_RECORD] = {0.0}, all[PCR_PLANT_NUMBERS];
     if (pcr_plant_status(plant) != PCR_OK) {
         return PCR_NOT_STARTED;
     }
-    if (numbers == NULL || !PCR_PLANT_MASSLESS) {
+    if (!PCR_PLANT_AS_MODEL) {
+        return PCR_NOT_HERE;
+    }
+    if (numbers == NULL) {
         return PCR_ARGUMENT;
     }
-    for (int i = 0; i < PCR_NUMBERS; i++) {
+    for (int i = 0; i < PCR_PLANT_NUMBERS; i++) {
         if (isnan(numbers[i])) { /* angles without stops are infinite */
             return PCR_ARGUMENT;
         }
     }
     memcpy(all, numbers, sizeof all);
-    all[PCR_TIP_MASS] += plant->payload;
-    memcpy(record, plant->memory, PCR_LOADS * sizeof *record);
-    if (!(all[PCR_TIP_MASS] > 0.0)) {
+    all[PCR_PLANT_TIP_MASS] += plant->payload;
+    memcpy(record, plant->memory, PCR_PLANT_START * sizeof *record);
+    if (!(all[PCR_PLANT_TIP_MASS] > 0.0)) {
         return PCR_ARGUMENT;
     }
     if (bring(plant, all, record)) {
         return PCR_OUT_OF_REACH;
     }
-    plant->tip_mass = numbers[PCR_TIP_MASS];
+    plant->tip_mass = numbers[PCR_PLANT_TIP_MASS];
     memcpy(plant->numbers, all, sizeof all);
     return PCR_OK;
 }
@@ -139,11 +145,11 @@ pcr_result pcr_plant_carry(pcr_plant *plant, double payload)
         return PCR_ARGUMENT;
     }
     /* M of the tip's motion [a, b; b, d], before and after; what is picked up was at rest, and momentum stays. */
-    double *mass = plant->numbers + PCR_TIP_MASS, a = *mass, b = 0.0, d = *mass;
+    double *mass = plant->numbers + PCR_PLANT_TIP_MASS, a = *mass, b = 0.0, d = *mass;
     const double before = plant->payload, change = payload - before;
     *mass = plant->tip_mass + payload;
     if (PCR_PLANT_CONSTANT) {
-        double *matrix = plant->memory + PCR_LOADS + 2;
+        double *matrix = plant->memory + PCR_PLANT_START + 2;
         a = matrix[0];
         b = matrix[1];
         d = matrix[3 + PCR_N];

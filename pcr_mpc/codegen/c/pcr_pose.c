@@ -3,28 +3,13 @@
 #include <string.h>
 
 #include "pcr_graphs.h"
-#include "pcr_parts.h"
+#include "pcr_watch.h"
 
 #define TORQUE_WATCHED 0.6
 #define MARGIN_WATCHED 0.25
 #define STIFFNESS_WATCHED 3.0
-#define STRAIN_WATCHED 0.8
 #define LEAST_CRITICAL_LOAD 5.7659
 #define LOOPED -13.0
-
-typedef struct {
-    pcr_controller *controller;
-    pcr_pose_limits *limits;
-    const double *x;
-    const double *record;
-    const double *result;
-    pcr_room room;
-} watch;
-
-static const double *rod(const watch *w, int i)
-{
-    return w->controller->parameters.numbers + i * PCR_ROD_NUMBERS; /* stiffness, length, base x, base y, ... */
-}
 
 /* Whether no limit can be near, by what the graph says of the pose ahead: the least eigenvalue of K, torques, and the
    shapes and loads of the rods. NaN is not far. */
@@ -38,7 +23,7 @@ static int far(const pcr_controller *controller)
     }
     for (int i = 0; i < PCR_N; i++) {
         if (PCR_WATCHES_STRAIN && isfinite(of->strain[i])
-            && !(2.0 * loads[i] * pcr_thickness[i] < STRAIN_WATCHED * of->strain[i])) {
+            && !(2.0 * loads[i] * pcr_thickness[i] < PCR_STRAIN_WATCHED * of->strain[i])) {
             return 0;
         }
         if (PCR_WATCHES_TORQUE && !(fabs(signs[1 + i]) < TORQUE_WATCHED * of->torque)) {
@@ -52,8 +37,12 @@ static int far(const pcr_controller *controller)
     return !PCR_WATCHES_MARGIN || greatest <= (1.0 - of->rod_margin - MARGIN_WATCHED) * LEAST_CRITICAL_LOAD;
 }
 
-/* A new row; returns its number. */
-static int row(watch *w, int kind, double scale)
+const double *pcr_rod(const pcr_watch *w, int i)
+{
+    return w->controller->parameters.numbers + i * PCR_ROD_NUMBERS;
+}
+
+int pcr_row(pcr_watch *w, int kind, double scale)
 {
     const int at = w->limits->count++;
     memset(w->limits->c[at], 0, sizeof w->limits->c[at]);
@@ -65,7 +54,7 @@ static int row(watch *w, int kind, double scale)
     return at;
 }
 
-static double times_state(const watch *w, int at)
+double pcr_times_state(const pcr_watch *w, int at)
 {
     double sum = 0.0;
     for (int l = 0; l < PCR_STATES; l++) {
@@ -74,48 +63,48 @@ static double times_state(const watch *w, int at)
     return sum;
 }
 
-/* Derivatives by the pose of rod i [x/L, y/L, angle], as those by the state. */
-static void by_state(const watch *w, int at, int i, const double *by_pose)
+void pcr_by_state(const pcr_watch *w, int at, int i, const double *by_pose)
 {
-    w->limits->c[at][0] += by_pose[0] / rod(w, i)[1];
-    w->limits->c[at][1] += by_pose[1] / rod(w, i)[1];
+    w->limits->c[at][0] += by_pose[0] / pcr_rod(w, i)[1];
+    w->limits->c[at][1] += by_pose[1] / pcr_rod(w, i)[1];
     w->limits->c[at][4 + i] += by_pose[2];
 }
 
-static void torque(watch *w, int kind)
+static void torque(pcr_watch *w, int kind)
 {
-    const double *loads = w->record + PCR_LOADS, *moves = w->record + PCR_LOAD_TANGENTS;
+    const double *loads = w->record + PCR_LOADS(PCR_WATCH_WIDTH);
+    const double *moves = w->record + PCR_LOAD_TANGENTS(PCR_WATCH_WIDTH);
     const double limit = w->controller->parameters.torque;
     double largest = 0.0;
     for (int i = 0; i < PCR_N; i++) {
-        const double tau = fabs(rod(w, i)[0] / rod(w, i)[1] * loads[3 * i + 2]);
+        const double tau = fabs(pcr_rod(w, i)[0] / pcr_rod(w, i)[1] * loads[3 * i + 2]);
         largest = tau > largest ? tau : largest;
     }
     if (largest < TORQUE_WATCHED * limit) {
         return;
     }
     for (int i = 0; i < PCR_N; i++) {
-        const int at = row(w, kind, limit);
-        const double unit = rod(w, i)[0] / rod(w, i)[1] / limit;
+        const int at = pcr_row(w, kind, limit);
+        const double unit = pcr_rod(w, i)[0] / pcr_rod(w, i)[1] / limit;
         double slopes[3];
         for (int j = 0; j < 3; j++) {
             slopes[j] = -unit * moves[3 * (3 * i + j) + 2];
         }
-        by_state(w, at, i, slopes);
-        const double rest = -unit * loads[3 * i + 2] - times_state(w, at);
+        pcr_by_state(w, at, i, slopes);
+        const double rest = -unit * loads[3 * i + 2] - pcr_times_state(w, at);
         w->limits->lower[at] = -1.0 - rest;
         w->limits->upper[at] = 1.0 - rest;
     }
 }
 
-static void tip_region(watch *w, int kind)
+static void tip_region(pcr_watch *w, int kind)
 {
     double unit = 0.0;
     for (int i = 0; i < PCR_N; i++) {
-        unit += rod(w, i)[1] / PCR_N;
+        unit += pcr_rod(w, i)[1] / PCR_N;
     }
     for (int j = 0; j < 2; j++) {
-        const int at = row(w, kind, unit);
+        const int at = pcr_row(w, kind, unit);
         w->limits->c[at][j] = 1.0 / unit;
         w->limits->lower[at] = w->controller->parameters.tip_lower[j] / unit;
         w->limits->upper[at] = w->controller->parameters.tip_upper[j] / unit;
@@ -141,7 +130,7 @@ static double rough_critical_load(double log_tip_angle)
 }
 
 /* Of d(tip) / d(log tip_angle, load), whose first zero is where a rod with its tip held loses stability. */
-static double determinant(const watch *w, double log_tip_angle, double load)
+static double determinant(const pcr_watch *w, double log_tip_angle, double load)
 {
     double found;
     w->room.arg[0] = &log_tip_angle;
@@ -152,7 +141,7 @@ static double determinant(const watch *w, double log_tip_angle, double load)
 }
 
 /* Zero between low and high, where the determinant has two signs, by bisection and secants. */
-static double zero(const watch *w, double log_tip_angle, double low, double high, double at_low, double at_high)
+static double zero(const pcr_watch *w, double log_tip_angle, double low, double high, double at_low, double at_high)
 {
     for (int i = 0; i < 200 && high - low > 1e-11; i++) {
         double middle = (low * at_high - high * at_low) / (at_high - at_low);
@@ -171,7 +160,7 @@ static double zero(const watch *w, double log_tip_angle, double low, double high
     return 0.5 * (low + high);
 }
 
-static double critical_load(const watch *w, double log_tip_angle)
+static double critical_load(const pcr_watch *w, double log_tip_angle)
 {
     static const double widths[3] = {0.02, 0.1, 0.4};
     if (log_tip_angle < LOOPED) {
@@ -193,7 +182,7 @@ static double critical_load(const watch *w, double log_tip_angle)
     return guess;
 }
 
-static double critical_load_slope(const watch *w, double log_tip_angle, double critical)
+static double critical_load_slope(const pcr_watch *w, double log_tip_angle, double critical)
 {
     const double h = 1e-4;
     const double by_angle = determinant(w, log_tip_angle + h, critical) - determinant(w, log_tip_angle - h, critical);
@@ -201,30 +190,30 @@ static double critical_load_slope(const watch *w, double log_tip_angle, double c
            / (determinant(w, log_tip_angle, critical + h) - determinant(w, log_tip_angle, critical - h));
 }
 
-static void rod_margins(watch *w, int kind)
+static void rod_margins(pcr_watch *w, int kind)
 {
-    const double *unknowns = w->record + PCR_UNKNOWNS, *tangents = w->record + PCR_TANGENTS;
+    const double *unknowns = w->record + PCR_UNKNOWNS, *tangents = w->record + PCR_TANGENTS(PCR_WATCH_WIDTH);
     const double least = w->controller->parameters.rod_margin, watched = 1.0 - least - MARGIN_WATCHED;
     int near = 0;
     for (int i = 0; i < PCR_N; i++) {
-        const double shape = unknowns[PCR_WIDTH * i], load = unknowns[PCR_WIDTH * i + 1];
+        const double shape = unknowns[PCR_WATCH_WIDTH * i], load = unknowns[PCR_WATCH_WIDTH * i + 1];
         near = near || (load > watched * LEAST_CRITICAL_LOAD && load > watched * rough_critical_load(shape));
     }
     for (int i = 0; near && i < PCR_N; i++) {
-        const double shape = unknowns[PCR_WIDTH * i], load = unknowns[PCR_WIDTH * i + 1];
+        const double shape = unknowns[PCR_WATCH_WIDTH * i], load = unknowns[PCR_WATCH_WIDTH * i + 1];
         const double critical = critical_load(w, shape), slope = critical_load_slope(w, shape, critical);
-        const int at = row(w, kind, 1.0);
+        const int at = pcr_row(w, kind, 1.0);
         double by_pose[3];
         for (int j = 0; j < 3; j++) {
-            const double *tangent = tangents + PCR_WIDTH * (3 * i + j);
+            const double *tangent = tangents + PCR_WATCH_WIDTH * (3 * i + j);
             by_pose[j] = (load / critical * slope * tangent[0] - tangent[1]) / critical;
         }
-        by_state(w, at, i, by_pose);
-        w->limits->lower[at] = least - (1.0 - load / critical) + times_state(w, at);
+        pcr_by_state(w, at, i, by_pose);
+        w->limits->lower[at] = least - (1.0 - load / critical) + pcr_times_state(w, at);
     }
 }
 
-static void stiffness(watch *w, int kind)
+static void stiffness(pcr_watch *w, int kind)
 {
     const double *k = w->result + 2, least = w->controller->parameters.stiffness;
     const double a = k[0], b = k[2], e = k[3], softest = (a + e) / 2.0 - hypot((a - e) / 2.0, b);
@@ -243,96 +232,56 @@ static void stiffness(watch *w, int kind)
     } else {
         v[0] = 1.0;
     }
-    const int at = row(w, kind, least);
+    const int at = pcr_row(w, kind, least);
     for (int i = 0; i < PCR_N; i++) {
-        const double *of = rod(w, i), unit = of[0] / (of[1] * of[1] * of[1]) / least;
+        const double *of = pcr_rod(w, i), unit = of[0] / (of[1] * of[1] * of[1]) / least;
         double curvature[12], by_pose[3];
-        w->room.arg[0] = w->record + PCR_UNKNOWNS + PCR_WIDTH * i;
-        w->room.arg[1] = w->record + PCR_POSES + 3 * i;
+        w->room.arg[0] = w->record + PCR_UNKNOWNS + PCR_WATCH_WIDTH * i;
+        w->room.arg[1] = w->record + PCR_POSES(PCR_WATCH_WIDTH) + 3 * i;
         w->room.res[0] = curvature;
         pcr_graph_curvature(w->room.arg, w->room.res, w->room.iw, w->room.w);
         for (int j = 0; j < 3; j++) {
             const double *of_k = curvature + 4 * j;
             by_pose[j] = unit * (v[0] * v[0] * of_k[0] + v[0] * v[1] * (of_k[1] + of_k[2]) + v[1] * v[1] * of_k[3]);
         }
-        by_state(w, at, i, by_pose);
+        pcr_by_state(w, at, i, by_pose);
     }
-    w->limits->lower[at] = 1.0 - softest / least + times_state(w, at);
-}
-
-/* K(k) of a plain rod with this tip angle, from k' = sin(tip_angle / 2), by the arithmetic-geometric mean. */
-static double quarter_period(double log_tip_angle)
-{
-    if (log_tip_angle < PCR_LOG_TAUT) {
-        return log(8.0) - log_tip_angle;
-    }
-    double a = 1.0, b = sin(exp(log_tip_angle) / 2.0);
-    for (int i = 0; i < 40 && fabs(a - b) > 1e-16 * a; i++) {
-        const double mean = 0.5 * (a + b);
-        b = sqrt(a * b);
-        a = mean;
-    }
-    return 1.57079632679489661923 / a;
-}
-
-static void strain(watch *w, int kind)
-{
-    const pcr_parameters *of = &w->controller->parameters;
-    double share[PCR_N], slopes[PCR_N][3];
-    int near = 0;
-    for (int i = 0; i < PCR_N; i++) {
-        const double *unknowns = w->record + PCR_UNKNOWNS + PCR_WIDTH * i;
-        const double *tangent = w->record + PCR_TANGENTS + 3 * PCR_WIDTH * i;
-        const double unit = pcr_thickness[i] / of->strain[i], load = unknowns[1];
-        if (!isfinite(of->strain[i])) {
-            continue;
-        }
-        if (load > quarter_period(unknowns[0])) {
-            const double half = exp(unknowns[0]) / 2.0, k = cos(half), slope = -half * sin(half);
-            share[i] = unit * 2.0 * k * load;
-            for (int j = 0; j < 3; j++) {
-                slopes[i][j] = unit * 2.0 * (slope * load * tangent[PCR_WIDTH * j] + k * tangent[PCR_WIDTH * j + 1]);
-            }
-        } else {
-            const double m = w->record[PCR_LOADS + 3 * i + 2];
-            share[i] = unit * fabs(m);
-            for (int j = 0; j < 3; j++) {
-                slopes[i][j] = copysign(unit, m) * w->record[PCR_LOAD_TANGENTS + 3 * (3 * i + j) + 2];
-            }
-        }
-        near = near || share[i] > STRAIN_WATCHED;
-    }
-    for (int i = 0; near && i < PCR_N; i++) {
-        if (isfinite(of->strain[i])) {
-            const int at = row(w, kind, of->strain[i]);
-            by_state(w, at, i, slopes[i]);
-            w->limits->upper[at] = 1.0 - share[i] + times_state(w, at);
-        }
-    }
+    w->limits->lower[at] = 1.0 - softest / least + pcr_times_state(w, at);
 }
 
 int pcr_near(pcr_controller *controller, pcr_pose_limits *limits)
 {
-    double record[PCR_RECORD], result[PCR_RESULT];
+    double following[PCR_WATCH_RECORD];
     const double *ahead = controller->out + PCR_OUT_AHEAD;
+    const double *from = controller->out + PCR_OUT_FOLLOWED + PCR_DELAY * PCR_RECORD;
     limits->kinds = limits->count = 0;
-    if (PCR_POSE_KINDS == 0 || far(controller)) {
+    if (PCR_POSE_KINDS == 0 || (PCR_WATCH_FOLLOWS && far(controller))) {
         return 0;
     }
-    watch w;
+    pcr_watch w;
     w.controller = controller;
     w.limits = limits;
     w.x = ahead;
-    w.record = record;
-    w.result = result;
+    w.record = PCR_WATCH_FOLLOWS ? following : controller->watch_record;
+    w.result = controller->watch_result;
     w.room.arg = controller->arg;
     w.room.res = controller->res;
     w.room.iw = controller->iw;
     w.room.w = controller->w;
-    memcpy(record, controller->out + PCR_OUT_FOLLOWED + PCR_DELAY * PCR_RECORD, sizeof record);
-    if (pcr_follow(pcr_graph_follow, pcr_graph_finish, controller->parameters.numbers, ahead, ahead + 4, 1e-6, record,
-                   result, w.room)) {
-        return 1;
+    if (PCR_WATCH_FOLLOWS) {
+        memcpy(following, from, sizeof following);
+    }
+    /* Rods of their own go on from where they are, and stay there if that is the pose. */
+    const int moved = PCR_WATCH_FOLLOWS || memcmp(controller->watch_at, ahead, 2 * sizeof *ahead) != 0
+                      || memcmp(controller->watch_at + 2, ahead + 4, PCR_N * sizeof *ahead) != 0;
+    if (moved) {
+        controller->watch_at[0] = NAN;
+        if (pcr_follow(&pcr_watch_rods, controller->watch_numbers, ahead, ahead + 4, 1e-6, w.record,
+                       controller->watch_result, w.room)) {
+            return 1;
+        }
+        memcpy(controller->watch_at, ahead, 2 * sizeof *ahead);
+        memcpy(controller->watch_at + 2, ahead + 4, PCR_N * sizeof *ahead);
     }
     int kind = 0;
     if (PCR_WATCHES_TORQUE) {
@@ -348,7 +297,7 @@ int pcr_near(pcr_controller *controller, pcr_pose_limits *limits)
         stiffness(&w, kind++);
     }
     if (PCR_WATCHES_STRAIN) {
-        strain(&w, kind++);
+        pcr_strain(&w, kind++);
     }
     return 0;
 }

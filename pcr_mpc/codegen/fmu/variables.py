@@ -139,7 +139,7 @@ def _start(subject: Subject) -> dict[str, list[Variable]]:
 def _plant(subject: Subject) -> Layout:
     plant, n = subject.plant, subject.robot.n_rods
     assert plant.step_model is not None
-    massless = plant.inertia == "none" and plant.weight == "none"
+    massless = subject.plant_as_model
     inputs = {
         "U": _each("u", "rad/s", "rate of motor", n, np.zeros(n)),
         "FORCE": _tip("force", "N", "force on the tip besides its weight", subject.scene.force),

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ellipkm1
 
 from ..rod import Rod
-from .equations import RodPhysics, sample_rod, unpacked
+from .equations import Layout, RodPhysics, sample_rod, unpacked
 
 _TAUT = 1e-8  # k'^2 below which it cannot be told from the base of a rod
 _LOG_TAUT = -15.0  # log tip angle below which K(k) is log(4 / k') to rounding
@@ -65,13 +65,18 @@ def strain_along(rod: Rod, nodes: np.ndarray, physics: RodPhysics | None, n_poin
     return np.asarray(np.abs(stretch) + rod.thickness_ratio * np.abs(bend))
 
 
+def strain_points(layout: Layout) -> int:
+    """Pieces into which `largest_strain` divides a rod, all knots of its properties among their ends."""
+    intervals = max(1, layout.intervals)
+    return intervals * math.ceil(_FEWEST_POINTS / intervals)
+
+
 def largest_strain(rod: Rod, nodes: np.ndarray, physics: RodPhysics) -> tuple[float, float]:
     """Where a rod that has no closed form is strained most, s in [0, 1], and how much.
 
     The largest sample of `strain_along` and a parabola through it and its neighbours.
     """
-    intervals = max(1, physics.layout.intervals)
-    count = intervals * math.ceil(_FEWEST_POINTS / intervals)
+    intervals, count = max(1, physics.layout.intervals), strain_points(physics.layout)
     strain = strain_along(rod, nodes, physics, count + 1)
     at = int(strain.argmax())
     # At the ends, and at knots, where the slope of a property changes, the largest is a sample.
