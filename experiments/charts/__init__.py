@@ -1,1 +1,1 @@
-"""Speed against accuracy on three levels: what `experiments.accuracy_vs_speed` measures, draws and compares."""
+"""Speed against accuracy on three levels: what `experiments.speed.accuracy_vs_speed` measures, draws and compares."""

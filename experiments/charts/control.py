@@ -129,11 +129,11 @@ def _measured(scene: Scene, tuning: Tuning, peer: str = "") -> Row:
 
 def _controller(scene: Scene, tuning: Tuning, peer: str) -> Controller:
     if peer == DO_MPC:
-        from experiments.do_mpc_controller import DoMPC
+        from experiments.peers.do_mpc_controller import DoMPC
 
         return DoMPC(scene, tuning)
     if peer == CROCODDYL:
-        from experiments.crocoddyl_controller import Crocoddyl
+        from experiments.peers.crocoddyl_controller import Crocoddyl
 
         return Crocoddyl(scene, tuning)
     return make_controller(scene, tuning)

@@ -23,8 +23,8 @@ import numpy as np
 from experiments.charts.points import Key, Row, times
 from experiments.charts.release import FINEST, MODES, error_of, failed, succeeded, swing, yardstick
 from experiments.charts.statics import LITERAL, LITERAL_AT_ONCE
-from experiments.literal_reading import LiteralReading, Solution
-from experiments.rod_inertia import RELEASES, STEP, start
+from experiments.motion.rod_inertia import RELEASES, STEP, start
+from experiments.peers.literal_reading import LiteralReading, Solution
 from pcr_mpc import PCRError, Plant, Robot
 from pcr_mpc.loop.run.simulated_plant import SimulatedPlant
 from pcr_mpc.plant.motion.rollout import rollout
@@ -174,7 +174,7 @@ def _in_one_call(robot: Robot, release: str, duration: float, make: partial[Plan
 def _engine_alone(robot: Robot, release: str, duration: float, integrator: str, links: int, dt: float) -> Row:
     import mujoco
 
-    from experiments.mujoco_agreement import engine_alone
+    from experiments.motion.mujoco_agreement import engine_alone
 
     complaints = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)  # a blow-up is a row, not a file in the working directory
@@ -191,7 +191,7 @@ def _engine_alone(robot: Robot, release: str, duration: float, integrator: str, 
 
 
 def _elastica(robot: Robot, release: str, duration: float, elements: int, radius: float) -> Row:
-    from experiments.pyelastica_release import release_tip
+    from experiments.peers.pyelastica_release import release_tip
 
     release_tip(robot, release, elements, radius, STEP)  # compiles
     tips, spent = release_tip(robot, release, elements, radius, duration)

@@ -14,7 +14,7 @@ from experiments.charts.motion import ELASTICA, MUJOCO, YARDSTICK
 from experiments.charts.points import Row
 from experiments.charts.statics import DERIVATIVES, LITERAL, LITERAL_AT_ONCE
 from experiments.charts.statics_poses import CLASSES
-from experiments.rod_inertia import RELEASES
+from experiments.motion.rod_inertia import RELEASES
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plt
 
 _INTEGRATORS = {"semi_implicit_euler": ("Euler", "o", 4), "velocity_verlet": ("Verlet", "s", 4), "rk4": ("RK4", "D", 5)}

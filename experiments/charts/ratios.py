@@ -11,7 +11,7 @@ from experiments.charts.motion import ELASTICA, MUJOCO, YARDSTICK
 from experiments.charts.points import Row, failures
 from experiments.charts.statics import LITERAL, LITERAL_AT_ONCE
 from experiments.charts.statics_poses import CLASSES
-from experiments.rod_inertia import RELEASES
+from experiments.motion.rod_inertia import RELEASES
 from pcr_mpc.report.tables import table
 
 # What the project promises: how many times faster, and how many times more accurate.

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from experiments.charts.points import Row, times
-from experiments.rod_inertia import STEP, start
+from experiments.motion.rod_inertia import STEP, start
 from pcr_mpc import Equilibrium, PCRError, Plant, Robot
 from pcr_mpc.loop.run.simulated_plant import SimulatedPlant
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.charts.points import Key, Row, times
 from experiments.charts.statics_poses import CLASSES, Pose, make_poses
-from experiments.literal_reading import LiteralReading
+from experiments.peers.literal_reading import LiteralReading
 from pcr_mpc import Equilibrium, PCRError, Robot
 from pcr_mpc.plant.statics.held_tip import checked_shooting, make_solver
 from pcr_mpc.plant.statics.single_shooting import SingleShooting

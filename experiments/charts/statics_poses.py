@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.basin_trials import CLASSES as BASINS
-from experiments.basin_trials import find_poses
+from experiments.statics.basin_trials import CLASSES as BASINS
+from experiments.statics.basin_trials import find_poses
 from pcr_mpc import Equilibrium, PCRError, Robot, UnreachableError, distance_to_fold, solve_statics
 from pcr_mpc.plant.rods import elastica
 from tests.rods import taylor_rod

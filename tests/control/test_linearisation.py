@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from experiments.finite_differences import error_curve
+from experiments.statics.finite_differences import error_curve
 from pcr_mpc import Plant, linearise, load_robot
 from tests.conftest import MODELS
 

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from experiments import benchmarks
-from experiments.benchmarks import Change, better_of, changes, show
+from experiments.speed import benchmarks
+from experiments.speed.benchmarks import Change, better_of, changes, show
 
 
 @pytest.mark.parametrize(

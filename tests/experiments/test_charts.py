@@ -8,7 +8,7 @@ from experiments.charts.control import DO_MPC
 from experiments.charts.draw import Look, draw_points
 from experiments.charts.motion import MUJOCO
 from experiments.charts.statics_poses import CLASSES, make_poses
-from experiments.literal_reading import LiteralReading
+from experiments.peers.literal_reading import LiteralReading
 from pcr_mpc import ConvergenceError, Plant, solve_statics
 from pcr_mpc.report.style import plt
 

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments import basins, growth, rod_inertia
+from experiments.motion import rod_inertia
+from experiments.speed import growth
+from experiments.statics import basins
 
 
 @pytest.fixture(scope="module")

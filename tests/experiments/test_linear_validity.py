@@ -3,8 +3,8 @@ import csv
 import numpy as np
 import pytest
 
-from experiments.linear_validity import main
-from experiments.linear_validity_radius import (
+from experiments.control.linear_validity import main
+from experiments.control.linear_validity_radius import (
     ALLOWED,
     motor_directions,
     predicted_radius,

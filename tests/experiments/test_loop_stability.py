@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments import loop_stability
-from experiments.loop_stability import (
+from experiments.control import loop_stability
+from experiments.control.loop_stability import (
     Line,
     Map,
     agreement,

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from experiments import monte_carlo
-from experiments.monte_carlo import correlations, main, sizes, summarise, worst
+from experiments.control import monte_carlo
+from experiments.control.monte_carlo import correlations, main, sizes, summarise, worst
 from pcr_mpc.study.episodes import EXACT, Spread
 from tests.conftest import MODELS
 from tests.study.test_parallel import Here

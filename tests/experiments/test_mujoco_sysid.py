@@ -10,13 +10,13 @@ from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
 from pcr_mpc.study.episodes import Spread, lighter
 
 pytest.importorskip("mujoco")
-from experiments import mujoco_sysid
-from experiments.identification import DEFAULT_SCENE, drive, reality
+from experiments.control.identification import DEFAULT_SCENE, drive, reality
+from experiments.peers import mujoco_sysid
 
 
 def test_the_simulation_that_is_fitted_is_the_one_that_ran(monkeypatch):
     """With the true numbers it ends where MuJoCo did with a fifth of its step; with others elsewhere."""
-    monkeypatch.setattr("experiments.identification.LINKS", 12)
+    monkeypatch.setattr("experiments.control.identification.LINKS", 12)
     monkeypatch.setattr(mujoco_sysid, "LINKS", 12)
     scene = lighter(replace(load_scene(DEFAULT_SCENE), duration=0.4))
     true = reality(scene, 1, Spread())

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments import open_loop_monte_carlo as study
-from experiments.open_loop_monte_carlo import KINDS, QUANTILES, main, move, told
+from experiments.motion import open_loop_monte_carlo as study
+from experiments.motion.open_loop_monte_carlo import KINDS, QUANTILES, main, move, told
 from pcr_mpc import PCRError, Plant, forward_statics, load_scene, sensitivities
 from pcr_mpc.study.episodes import lighter
 

@@ -15,7 +15,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # do-mpc says which of its optional features are not installed
     pytest.importorskip("do_mpc")
 
-from experiments.do_mpc_controller import DoMPC
+from experiments.peers.do_mpc_controller import DoMPC
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_do_mpc_failing_is_an_error(scene):
 def test_crocoddyl_decides_as_the_nonlinear_mpc(scene):
     """Without limits that it does not know: DDP on the plant itself, the same inputs."""
     pytest.importorskip("crocoddyl")
-    from experiments.crocoddyl_controller import Crocoddyl
+    from experiments.peers.crocoddyl_controller import Crocoddyl
 
     pose = scene.start()
     theirs, ours = Crocoddyl(scene, scene.tuning), TrackingController(scene, scene.tuning)

@@ -6,7 +6,7 @@ import re
 import pytest
 
 import pcr_mpc
-from experiments import text_figures
+from experiments.upkeep import text_figures
 from tests.conftest import ROOT
 
 

@@ -1,4 +1,4 @@
-"""The workspace of `experiments/workspace.py` against symmetry, finite differences and the free tip."""
+"""The workspace of `experiments/statics/workspace.py` against symmetry, finite differences and the free tip."""
 
 import csv
 import sys
@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from experiments import workspace
-from experiments.workspace import areas, stop_distance
+from experiments.statics import workspace
+from experiments.statics.workspace import areas, stop_distance
 from pcr_mpc import Equilibrium, PCRError, Robot, forward_statics, inverse_statics, solve_statics
 from pcr_mpc.study.workspace_sheet import Sheet, explore, turn_between
 

@@ -1,0 +1,1 @@
+"""Studies of how the robot moves by itself."""

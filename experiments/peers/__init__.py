@@ -1,0 +1,1 @@
+"""Other people's models, engines and controllers, made comparable."""

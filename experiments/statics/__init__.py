@@ -1,0 +1,1 @@
+"""Studies of poses: which there are, which are stable, where methods fail."""

@@ -1,0 +1,1 @@
+"""What keeps pages, pictures and tests honest."""
