@@ -61,8 +61,9 @@ if TYPE_CHECKING:
     from .plant.uncertainty import Uncertainty, load_uncertainty
     from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
     from .report.tables import equilibria_table, equilibrium_table, summary_table
-    from .study.episodes import run_episode, simulate_episode
-    from .study.excitation import Excitation, excite
+    from .study.episodes.episodes import run_episode, simulate_episode
+    from .study.episodes.spread import Spread
+    from .study.excitation.design import Excitation, excite
     from .study.identification.identify import identify
     from .study.identification.log import Log, read_log
     from .study.identification.result import Identification
@@ -71,7 +72,6 @@ if TYPE_CHECKING:
     from .study.planning.limits import PlanLimits
     from .study.planning.plan import plan_timing
     from .study.planning.timed_path import TimedPath
-    from .study.spread import Spread
 
 __all__ = [
     "MATERIALS",
@@ -226,8 +226,9 @@ _WHERE = {
     "report.plots": ("animate_run", "plot_equilibria", "plot_equilibrium", "plot_run"),
     "report.tables": ("equilibria_table", "equilibrium_table", "summary_table"),
     "plant.uncertainty": ("Uncertainty", "load_uncertainty"),
-    "study.episodes": ("run_episode", "simulate_episode"),
-    "study.excitation": ("Excitation", "excite"),
+    "study.episodes.episodes": ("run_episode", "simulate_episode"),
+    "study.episodes.spread": ("Spread",),
+    "study.excitation.design": ("Excitation", "excite"),
     "study.identification.identify": ("identify",),
     "study.identification.log": ("Log", "read_log"),
     "study.identification.result": ("Identification",),
@@ -236,7 +237,6 @@ _WHERE = {
     "study.planning.limits": ("PlanLimits",),
     "study.planning.plan": ("plan_timing",),
     "study.planning.timed_path": ("TimedPath",),
-    "study.spread": ("Spread",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 

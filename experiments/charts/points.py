@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from pcr_mpc.study.machine import machine
-from pcr_mpc.study.provenance import commit
+from pcr_mpc.study.episodes.provenance import commit
+from pcr_mpc.study.timing.machine import machine
 
 Row = dict[str, Any]
 Key = tuple[str, str, str]

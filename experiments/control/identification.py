@@ -30,11 +30,11 @@ from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, plt, save_figure
 from pcr_mpc.report.tables import table
-from pcr_mpc.study.episodes import Spread, lighter
+from pcr_mpc.study.episodes.episodes import Spread, lighter
+from pcr_mpc.study.episodes.parallel import collect, local_workers
+from pcr_mpc.study.episodes.provenance import described, source_digest
 from pcr_mpc.study.identification.identify import identify
 from pcr_mpc.study.identification.log import Log
-from pcr_mpc.study.parallel import collect, local_workers
-from pcr_mpc.study.provenance import described, source_digest
 
 Row = dict[str, Any]
 MODELS = Path(__file__).parents[2] / "models"
@@ -191,7 +191,7 @@ def plot(rows: list[Row], title: str, path: Path) -> None:
 SHEET = """# Logs of planar parallel continuum robots
 
 {count} logs of a pair of rods on a figure of eight, {plant}. Each robot is not as believed: its
-numbers are drawn from its seed by `pcr_mpc.study.episodes.Spread`. Made by
+numbers are drawn from its seed by `pcr_mpc.study.episodes.spread.Spread`. Made by
 `python -m experiments.control.identification --logs FOLDER --plant {arm} --episodes {count} --duration {duration:g}`,
 and again from the same seeds. MIT licence.
 

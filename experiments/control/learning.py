@@ -24,8 +24,8 @@ from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.laps import draw_errors
 from pcr_mpc.report.style import BLUE, GREEN, ORANGE, plt, save_figure
 from pcr_mpc.report.tables import table
-from pcr_mpc.study.episodes import Spread, lighter
-from pcr_mpc.study.parallel import local_workers
+from pcr_mpc.study.episodes.episodes import Spread, lighter
+from pcr_mpc.study.episodes.parallel import local_workers
 
 SCENES = Path(__file__).parents[2] / "models" / "scenes"
 ARMS = {"as it is": ORANGE, "learning": BLUE, "true numbers": GREEN}

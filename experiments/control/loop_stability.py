@@ -34,10 +34,10 @@ from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import RED, plt, save_figure
 from pcr_mpc.report.tables import table
+from pcr_mpc.study.episodes.parallel import finished, local_workers
 from pcr_mpc.study.margins.measured import Pushed, PushTest
 from pcr_mpc.study.margins.poses import LINEAR_LAWS, LinearLoops, scaled, scaled_scene
 from pcr_mpc.study.margins.predicted import path_radius
-from pcr_mpc.study.parallel import finished, local_workers
 
 ROOT = Path(__file__).parents[2]
 SCENE = ROOT / "models" / "scenes" / "lemniscate.toml"

@@ -1,9 +1,9 @@
 """How robust is a controller? Many episodes in which the robot is not quite what the controller believes.
 
 In each episode bending stiffness, mass, drag, bases, delay, sensors and load are off by amounts drawn from its seed
-(`pcr_mpc.study.episodes.Spread` gives the ranges and their reasons). Prints the failure rate with its 95 % confidence
-interval, the distribution of the RMS error, and the command that replays the worst episode. Finished episodes are
-kept in episodes.jsonl: the same command, given again, goes on where the last one ended.
+(`pcr_mpc.study.episodes.spread.Spread` gives the ranges and their reasons). Prints the failure rate with its 95 %
+confidence interval, the distribution of the RMS error, and the command that replays the worst episode. Finished
+episodes are kept in episodes.jsonl: the same command, given again, goes on where the last one ended.
 
     python -m experiments.control.monte_carlo --episodes 500
     python -m experiments.control.monte_carlo --episodes 20000 --dask tcp://scheduler:8786
@@ -47,9 +47,9 @@ from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.plots import animate_run, plot_run
 from pcr_mpc.report.style import BLUE, GREY, ORANGE, RED, plt
 from pcr_mpc.report.tables import summary_table, table
-from pcr_mpc.study.episodes import ALLOWED_ERROR, SETTLING, lighter, run_episode, simulate_episode
-from pcr_mpc.study.parallel import collect, local_workers
-from pcr_mpc.study.provenance import described, source_digest
+from pcr_mpc.study.episodes.episodes import ALLOWED_ERROR, SETTLING, lighter, run_episode, simulate_episode
+from pcr_mpc.study.episodes.parallel import collect, local_workers
+from pcr_mpc.study.episodes.provenance import described, source_digest
 
 Row = dict[str, Any]
 MODELS = Path(__file__).parents[2] / "models"

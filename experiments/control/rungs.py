@@ -17,8 +17,8 @@ from pcr_mpc import load_scene
 from pcr_mpc.errors import NoRungError
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, plt
-from pcr_mpc.study.choice import Choice, choose
-from pcr_mpc.study.rungs import ladders, levels
+from pcr_mpc.study.choice.choice import Choice, choose
+from pcr_mpc.study.choice.rungs import ladders, levels
 
 SCENES = Path(__file__).parents[2] / "models" / "scenes"
 NAMES = ("hold_slow", "release", "payload", "vertical", "heavy_rods", "curved_rods", "near_straight")

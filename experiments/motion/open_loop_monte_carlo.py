@@ -2,8 +2,8 @@
 
 The motors turn at the rates that the inverse dynamics of the scene's reference ask of the believed robot. Robots whose
 bending stiffness, tip mass, drag and bases are off by amounts drawn from their seeds (ranges and reasons in
-`pcr_mpc.study.episodes.Spread`), all at once and one kind at a time, start at rest at the same motor angles and are
-moved by `rollout`, many in one call. The error is the distance of a tip from where the believed robot's is at that
+`pcr_mpc.study.episodes.spread.Spread`), all at once and one kind at a time, start at rest at the same motor angles and
+are moved by `rollout`, many in one call. The error is the distance of a tip from where the believed robot's is at that
 time. Beside it stands what the derivatives of the believed robot's motion (`sensitivities`) predict of the same robots.
 Robots that cannot follow are counted, with their reasons.
 
@@ -40,7 +40,7 @@ from pcr_mpc.loop.demand.feed_forward import feed_forward
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, plt, save_figure
 from pcr_mpc.report.tables import table
-from pcr_mpc.study.episodes import EXACT, Spread, lighter
+from pcr_mpc.study.episodes.episodes import EXACT, Spread, lighter
 
 MODELS = Path(__file__).parents[2] / "models"
 DEFAULT_SCENE = MODELS / "scenes" / "lemniscate.toml"

@@ -39,7 +39,7 @@ from experiments.control.identification import (
 from pcr_mpc import PCRError, Robot, Run, Scene, load_scene
 from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
 from pcr_mpc.report.tables import table
-from pcr_mpc.study.episodes import Spread, lighter
+from pcr_mpc.study.episodes.episodes import Spread, lighter
 from pcr_mpc.study.identification.identify import identify
 from pcr_mpc.study.identification.parameters import Parameters, catalogue, chosen
 

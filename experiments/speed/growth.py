@@ -30,7 +30,7 @@ from pcr_mpc.loop.run.simulate import simulate
 from pcr_mpc.plant.motion.step_graph import step_function
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.style import BLUE, GREEN, GREY, ORANGE, plt
-from pcr_mpc.study.machine import machine
+from pcr_mpc.study.timing.machine import machine
 
 CODES = ("interpreted", "compiled") if has_compiler() else ("interpreted",)
 CENTRE, RADIUS, BOW = (0.0, 0.25), 0.27, 2.177  # m, m, and angle of a rod's motor from the direction to the tip [rad]

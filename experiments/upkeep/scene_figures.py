@@ -20,8 +20,8 @@ from typing import Any
 from tqdm import tqdm
 
 from pcr_mpc import Motors, Scene, SimulationError, load_scene, load_tuning, make_controller, simulate
-from pcr_mpc.study.machine import machine, versions
-from pcr_mpc.study.provenance import commit
+from pcr_mpc.study.episodes.provenance import commit
+from pcr_mpc.study.timing.machine import machine, versions
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "models" / "scenes"

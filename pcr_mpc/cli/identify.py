@@ -18,12 +18,12 @@ from ..report.identification import (
     identification_table,
     plot_identification,
 )
-from ..study.excitation import excite
-from ..study.excitation_file import PATH, SCENE, require_readable, write_path, write_scene
+from ..study.episodes.provenance import commit
+from ..study.excitation.design import excite
+from ..study.excitation.file import PATH, SCENE, require_readable, write_path, write_scene
 from ..study.identification.identify import identify
 from ..study.identification.log import Log, read_log
 from ..study.identification.robot_file import robot_path, write_robot
-from ..study.provenance import commit
 
 _FILES = ("identification.json", "identification.png")
 _EXCITED = (PATH, SCENE, "excitation.json", "excitation.png")

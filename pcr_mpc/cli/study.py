@@ -21,17 +21,17 @@ from ..report.csv_rows import write_rows
 from ..report.timing import plot_timing, timing_tables
 from ..report.trade_off import plot_trade_off
 from ..report.tuning_tables import tuning_comments, tuning_table
-from ..study.choice import choose
-from ..study.chosen_rung import require_plant_table, write_rung
-from ..study.episodes import lighter
+from ..study.choice.choice import choose
+from ..study.choice.file import require_plant_table, write_rung
+from ..study.episodes.episodes import lighter
+from ..study.episodes.parallel import local_workers
+from ..study.episodes.provenance import commit
+from ..study.episodes.spread import Spread
 from ..study.identification.robot_file import robot_path
-from ..study.parallel import local_workers
-from ..study.provenance import commit
-from ..study.spread import Spread
-from ..study.timing import time_scene
-from ..study.tuning_file import default_path, to_tune, write_tuning
-from ..study.tuning_space import Search
-from ..study.tuning_study import finished_trials, tune
+from ..study.timing.timing import time_scene
+from ..study.tuning.file import default_path, to_tune, write_tuning
+from ..study.tuning.space import Search
+from ..study.tuning.study import finished_trials, tune
 
 _TIMING = ("timing.json", "timing.png")
 _TRIALS = ("trials.csv", "trade_off.png")

@@ -8,9 +8,9 @@ from typing import Any
 
 from ..loop.scene.scene import Scene
 from ..loop.scene.settings import PlantSettings
-from ..study.choice import Choice, Measured, apart
-from ..study.estimates import Estimate
-from ..study.rungs import ladders, levels, named
+from ..study.choice.choice import Choice, Measured, apart
+from ..study.choice.estimates import Estimate
+from ..study.choice.rungs import ladders, levels, named
 from .tables import table
 
 _NOT_WORTH = "not worth its time"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..loop.references.trajectory import sampled
-from ..study.excitation import Excitation, Expected
+from ..study.excitation.design import Excitation, Expected
 from .style import BLUE, GREY, ORANGE, plt, save_figure
 from .tables import table
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..study.tuning_space import Search
-from ..study.tuning_study import Chosen
+from ..study.tuning.space import Search
+from ..study.tuning.study import Chosen
 from .tables import table
 
 

@@ -22,7 +22,7 @@ from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.free_tip import forward_statics
 from ..plant.statics.stability import all_equilibria
-from ..study.parallel import follow_the_parent
+from ..study.episodes.parallel import follow_the_parent
 from ..study.workspace_sheet import explore, make_mesh
 from .frames import centrelines, rounded
 

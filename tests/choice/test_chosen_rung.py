@@ -10,9 +10,9 @@ import pytest
 from pcr_mpc import ModelError, load_scene
 from pcr_mpc.cli import main
 from pcr_mpc.loop.run.finding import digest, verified
-from pcr_mpc.study.choice import choose
-from pcr_mpc.study.chosen_rung import write_rung
-from pcr_mpc.study.rungs import ladders, levels
+from pcr_mpc.study.choice.choice import choose
+from pcr_mpc.study.choice.file import write_rung
+from pcr_mpc.study.choice.rungs import ladders, levels
 from tests.conftest import CONTROLLERS, MODELS
 
 SCENES = MODELS / "scenes"

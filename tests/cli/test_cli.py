@@ -68,7 +68,7 @@ def test_statics_three_ways(capsys, tmp_path):
 
 
 def test_timing(scene, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pcr_mpc.study.stopwatch._INTERRUPTED", math.inf)  # however busy the machine is
+    monkeypatch.setattr("pcr_mpc.study.timing.stopwatch._INTERRUPTED", math.inf)  # however busy the machine is
     assert main(["timing", str(scene), "--steps", "60", "--json", "--out", str(tmp_path / "t")]) == 0
     result = json.loads(capsys.readouterr().out)
     names = {(c["name"], c["method"]) for c in result["components"]}

@@ -12,8 +12,8 @@ from matplotlib import image
 from pcr_mpc import PCRError, load_scene
 from pcr_mpc.cli import main
 from pcr_mpc.cli import statics as cli_statics
-from pcr_mpc.study import tuning_space
-from pcr_mpc.study.episodes import Spread
+from pcr_mpc.study.episodes.spread import Spread
+from pcr_mpc.study.tuning import space as tuning_space
 from tests.conftest import CONTROLLERS, MODELS
 
 PAIR = str(MODELS / "planar_pair.toml")

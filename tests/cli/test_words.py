@@ -31,9 +31,9 @@ from pcr_mpc.control.observer import ObserverTuning
 from pcr_mpc.loop.run.finding import digest
 from pcr_mpc.loop.scene.settings import Finding
 from pcr_mpc.plant.statics.free_tip import _require_usable
-from pcr_mpc.study.episodes import Spread, run_episode
-from pcr_mpc.study.provenance import described, differences
-from pcr_mpc.study.tuning_file import to_tune, write_tuning
+from pcr_mpc.study.episodes.episodes import Spread, run_episode
+from pcr_mpc.study.episodes.provenance import described, differences
+from pcr_mpc.study.tuning.file import to_tune, write_tuning
 from tests.conftest import CONTROLLERS, MODELS
 
 SCENES = MODELS / "scenes"

@@ -14,7 +14,7 @@ from pcr_mpc.loop.demand.feed_forward import feed_forward
 from pcr_mpc.loop.demand.track import Track
 from pcr_mpc.loop.parts.assembled import resting_model
 from pcr_mpc.loop.scene.settings import Payload
-from pcr_mpc.study.tuning_file import write_tuning
+from pcr_mpc.study.tuning.file import write_tuning
 from tests.conftest import CONTROLLERS, MODELS
 
 PICKED, ADDED = 1.0, 0.1  # s, kg

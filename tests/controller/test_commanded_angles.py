@@ -7,7 +7,7 @@ import pytest
 
 from pcr_mpc import ModelError, SimulationError, load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.loop.hardware.motors import Motors
-from pcr_mpc.study.tuning_file import write_tuning
+from pcr_mpc.study.tuning.file import write_tuning
 from tests.conftest import CONTROLLERS, MODELS
 
 LAG = 0.02

@@ -24,7 +24,7 @@ from pcr_mpc.control.qp import build_qp
 from pcr_mpc.control.tuning import Limits
 from pcr_mpc.linearisation.linear_limits import LinearLimits
 from pcr_mpc.linearisation.linear_model import LinearModels
-from pcr_mpc.study.tuning_file import write_tuning
+from pcr_mpc.study.tuning.file import write_tuning
 from tests.conftest import CONTROLLERS, MODELS
 
 TUNING = replace(load_tuning(CONTROLLERS / "default.toml"), horizon=6, solver="daqp")

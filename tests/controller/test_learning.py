@@ -15,8 +15,8 @@ from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.learning.harmonics import Harmonics
 from pcr_mpc.loop.learning.laps import laps_of
 from pcr_mpc.loop.learning.learner import Learner
-from pcr_mpc.study.episodes import EXACT, Spread, simulate_episode
-from pcr_mpc.study.tuning_file import write_tuning
+from pcr_mpc.study.episodes.episodes import EXACT, Spread, simulate_episode
+from pcr_mpc.study.tuning.file import write_tuning
 from tests.conftest import CONTROLLERS, MODELS
 
 LAP, LAPS = 1.0, 5

@@ -8,7 +8,7 @@ import pytest
 
 from experiments.control import monte_carlo
 from experiments.control.monte_carlo import correlations, main, sizes, summarise, worst
-from pcr_mpc.study.episodes import EXACT, Spread
+from pcr_mpc.study.episodes.episodes import EXACT, Spread
 from tests.conftest import MODELS
 from tests.study.test_parallel import Here
 

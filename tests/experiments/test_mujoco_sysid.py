@@ -7,7 +7,7 @@ import pytest
 
 from pcr_mpc import load_scene
 from pcr_mpc.plant.mujoco.plant import MuJoCoPlant
-from pcr_mpc.study.episodes import Spread, lighter
+from pcr_mpc.study.episodes.episodes import Spread, lighter
 
 pytest.importorskip("mujoco")
 from experiments.control.identification import DEFAULT_SCENE, drive, reality

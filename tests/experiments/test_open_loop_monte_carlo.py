@@ -9,7 +9,7 @@ import pytest
 from experiments.motion import open_loop_monte_carlo as study
 from experiments.motion.open_loop_monte_carlo import KINDS, QUANTILES, main, move, told
 from pcr_mpc import PCRError, Plant, forward_statics, load_scene, sensitivities
-from pcr_mpc.study.episodes import lighter
+from pcr_mpc.study.episodes.episodes import lighter
 
 ARGUMENTS = ["--robots", "3", "--duration", "0.2", "--seed", "5"]
 

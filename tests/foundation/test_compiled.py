@@ -304,7 +304,7 @@ def test_the_fastest_is_machine_code_if_that_is_wanted(folder):
         ("echo 'out of coffee' >&2; exit 3", "out of coffee"),
         ("exit 3", "status 3"),
         ("exit 0", "status 0"),  # and made nothing
-        ('for last; do :; done; echo junk > "$(echo "$*" | sed "s/.* -o \\([^ ]*\\).*/\\1/")"', "small"),
+        ('[ "$1" = --version ] || echo junk > "$(echo "$*" | sed "s/.* -o \\([^ ]*\\).*/\\1/")"', "small"),
     ],
     ids=["says why", "silent", "makes nothing", "makes junk"],
 )

@@ -17,8 +17,8 @@ from pcr_mpc.cli.parser import METHODS
 from pcr_mpc.errors import OutputError
 from pcr_mpc.files import ours, replacing, require_free, results, stamped, write_text
 from pcr_mpc.plant.statics import held_tip as statics
-from pcr_mpc.study.chosen_rung import _renewed
-from pcr_mpc.study.tuning_file import write_tuning
+from pcr_mpc.study.choice.file import _renewed
+from pcr_mpc.study.tuning.file import write_tuning
 from tests.conftest import CONTROLLERS, MODELS
 
 PAIR = str(MODELS / "planar_pair.toml")

@@ -17,8 +17,8 @@ import pytest
 
 from pcr_mpc import HoldMotors, SimulationError, interrupt, load_scene, simulate
 from pcr_mpc.cli import main
-from pcr_mpc.study.choice import choose
-from pcr_mpc.study.parallel import as_finished, local_workers
+from pcr_mpc.study.choice.choice import choose
+from pcr_mpc.study.episodes.parallel import as_finished, local_workers
 from tests.conftest import CONTROLLERS, MODELS, ROOT
 from tests.study.test_parallel import processes_of, wait_until
 
@@ -81,7 +81,7 @@ def test_no_rung_is_chosen_once_it_is_interrupted(release, monkeypatch):
             os.kill(os.getpid(), signal.SIGINT)
         return simulate(scene, *arguments, **keywords)
 
-    monkeypatch.setattr("pcr_mpc.study.choice.simulate", pressed)
+    monkeypatch.setattr("pcr_mpc.study.choice.choice.simulate", pressed)
     with interrupt.listening(), pytest.raises(KeyboardInterrupt):
         choose(replace(release, duration=0.05))
     assert len(calls) == 3
@@ -204,7 +204,7 @@ def test_ctrl_c_in_a_terminal_leaves_no_workers_and_no_tracebacks(tmp_path):
         """
 import pathlib, sys
 from pcr_mpc import interrupt
-from pcr_mpc.study.parallel import finished, local_workers
+from pcr_mpc.study.episodes.parallel import finished, local_workers
 import time
 if __name__ == "__main__":
     try:

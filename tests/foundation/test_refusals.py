@@ -23,7 +23,7 @@ from pcr_mpc.plant.mujoco import hinge_chain
 from pcr_mpc.plant.rods import snap
 from pcr_mpc.plant.statics import balance, free_tip, solver
 from pcr_mpc.plant.statics.single_shooting import SingleShooting
-from pcr_mpc.study import choice
+from pcr_mpc.study.choice import choice
 from tests.conftest import MODELS
 
 SCENES = MODELS / "scenes"

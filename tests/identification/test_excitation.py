@@ -10,7 +10,7 @@ from pcr_mpc import load_scene
 from pcr_mpc.cli import main
 from pcr_mpc.loop.demand.feed_forward import feed_forward
 from pcr_mpc.loop.references.path_file import load_path
-from pcr_mpc.study.excitation import MultiSine, excite, expected
+from pcr_mpc.study.excitation.design import MultiSine, excite, expected
 from pcr_mpc.study.identification.problem import Noise
 from tests.conftest import MODELS
 

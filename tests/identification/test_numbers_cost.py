@@ -8,11 +8,11 @@ import pytest
 
 from pcr_mpc import Plant, Uncertainty, load_scene, make_controller, rollout, simulate
 from pcr_mpc.report.choice_tables import choice_record, choice_table
-from pcr_mpc.study.choice import Choice, Measured
-from pcr_mpc.study.estimates import Estimates
+from pcr_mpc.study.choice.choice import Choice, Measured
+from pcr_mpc.study.choice.estimates import Estimates
+from pcr_mpc.study.choice.numbers_cost import NumbersCost, assumed_uncertainty, numbers_cost
+from pcr_mpc.study.choice.rungs import all_physics
 from pcr_mpc.study.identification.parameters import robot_with
-from pcr_mpc.study.numbers_cost import NumbersCost, assumed_uncertainty, numbers_cost
-from pcr_mpc.study.rungs import all_physics
 from tests.conftest import MODELS
 
 NAMES = ("rods[0].bending_stiffness", "rods[1].bending_stiffness", "rods[0].base_x")

@@ -24,8 +24,8 @@ from pcr_mpc import (
 )
 from pcr_mpc.cli import main
 from pcr_mpc.loop.controller.own_controller import OwnController, built
-from pcr_mpc.study.episodes import EXACT
-from pcr_mpc.study.provenance import described
+from pcr_mpc.study.episodes.episodes import EXACT
+from pcr_mpc.study.episodes.provenance import described
 from tests.conftest import MODELS
 
 SCENE = MODELS / "scenes" / "lemniscate.toml"

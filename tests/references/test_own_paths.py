@@ -12,12 +12,12 @@ from pcr_mpc.errors import StudyError
 from pcr_mpc.loop.references.reading import built_in
 from pcr_mpc.loop.run.finding import digest
 from pcr_mpc.report.plots import animate_run, plot_run
-from pcr_mpc.study import episodes
-from pcr_mpc.study.episodes import Spread
-from pcr_mpc.study.parallel import finished, local_workers
-from pcr_mpc.study.provenance import described, differences
-from pcr_mpc.study.tuning_space import Search
-from pcr_mpc.study.tuning_study import tune
+from pcr_mpc.study.episodes import episodes
+from pcr_mpc.study.episodes.parallel import finished, local_workers
+from pcr_mpc.study.episodes.provenance import described, differences
+from pcr_mpc.study.episodes.spread import Spread
+from pcr_mpc.study.tuning.space import Search
+from pcr_mpc.study.tuning.study import tune
 from tests.conftest import CONTROLLERS, MODELS
 
 TURN = Blended(Circle((0.0, 0.25), 0.02, 1.5))

@@ -21,13 +21,13 @@ from pcr_mpc.report.tables import (
     times_table,
 )
 from pcr_mpc.report.tuning_tables import tuning_comments, tuning_table
-from pcr_mpc.study.choice import Choice, Measured
-from pcr_mpc.study.episodes import Spread
-from pcr_mpc.study.estimates import Estimate
-from pcr_mpc.study.rungs import all_physics
-from pcr_mpc.study.tuning_score import Costs
-from pcr_mpc.study.tuning_space import Search
-from pcr_mpc.study.tuning_study import Chosen
+from pcr_mpc.study.choice.choice import Choice, Measured
+from pcr_mpc.study.choice.estimates import Estimate
+from pcr_mpc.study.choice.rungs import all_physics
+from pcr_mpc.study.episodes.spread import Spread
+from pcr_mpc.study.tuning.score import Costs
+from pcr_mpc.study.tuning.space import Search
+from pcr_mpc.study.tuning.study import Chosen
 from tests.conftest import CONTROLLERS, MODELS
 from tests.run.test_promises_simulate import resting
 

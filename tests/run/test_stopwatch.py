@@ -5,8 +5,8 @@ import gc
 import numpy as np
 import pytest
 
-from pcr_mpc.study import overhead, stopwatch
-from pcr_mpc.study.stopwatch import WARM_UP, Times, measure
+from pcr_mpc.study.timing import overhead, stopwatch
+from pcr_mpc.study.timing.stopwatch import WARM_UP, Times, measure
 
 
 def test_record_keeps_the_first_calls_apart():

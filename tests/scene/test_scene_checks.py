@@ -10,8 +10,8 @@ from pcr_mpc import ModelError, load_robot, load_scene, load_tuning
 from pcr_mpc.files import name_problem
 from pcr_mpc.loop.references.trajectory import Hold, Lemniscate, PickAndPlace
 from pcr_mpc.loop.scene.settings import Need, Payload
-from pcr_mpc.study.episodes import Spread
-from pcr_mpc.study.tuning_space import Search, space
+from pcr_mpc.study.episodes.spread import Spread
+from pcr_mpc.study.tuning.space import Search, space
 from tests.conftest import CONTROLLERS, MODELS
 
 LEMNISCATE = MODELS / "scenes" / "lemniscate.toml"

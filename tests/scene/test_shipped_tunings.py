@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 
 from pcr_mpc import load_scene, load_tuning, make_controller, simulate
-from pcr_mpc.study.episodes import Spread, lighter
-from pcr_mpc.study.tuning_file import to_tune
-from pcr_mpc.study.tuning_score import measure, score
+from pcr_mpc.study.episodes.episodes import Spread, lighter
+from pcr_mpc.study.tuning.file import to_tune
+from pcr_mpc.study.tuning.score import measure, score
 from tests.conftest import CONTROLLERS, MODELS
 
 SCENES = sorted(path for path in (MODELS / "scenes").glob("*.toml") if (CONTROLLERS / path.name).exists())

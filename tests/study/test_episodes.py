@@ -13,8 +13,8 @@ from pcr_mpc import ModelError, Uncertainty, load_scene, make_controller, simula
 from pcr_mpc.loop.demand.feed_forward import feed_forward
 from pcr_mpc.loop.parts.controllers import HoldMotors
 from pcr_mpc.loop.references.trajectory import Hold
-from pcr_mpc.study import episodes
-from pcr_mpc.study.episodes import ALLOWED_ERROR, EXACT, Spread, run_episode, simulate_episode
+from pcr_mpc.study.episodes import episodes
+from pcr_mpc.study.episodes.episodes import ALLOWED_ERROR, EXACT, Spread, run_episode, simulate_episode
 from tests.conftest import MODELS
 
 

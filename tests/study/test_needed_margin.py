@@ -7,9 +7,11 @@ import pytest
 
 from pcr_mpc import ModelError, load_scene, load_tuning
 from pcr_mpc.report.tables import _margin_lines
-from pcr_mpc.study import tuning_score, tuning_space, tuning_study
-from pcr_mpc.study.episodes import Spread
-from pcr_mpc.study.tuning_score import Costs, measure, score
+from pcr_mpc.study.episodes.spread import Spread
+from pcr_mpc.study.tuning import score as tuning_score
+from pcr_mpc.study.tuning import space as tuning_space
+from pcr_mpc.study.tuning import study as tuning_study
+from pcr_mpc.study.tuning.score import Costs, measure, score
 from tests.conftest import CONTROLLERS, MODELS
 
 from .test_parallel import Here

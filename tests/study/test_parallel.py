@@ -15,9 +15,9 @@ import pytest
 
 from pcr_mpc import load_scene
 from pcr_mpc.errors import StudyError
-from pcr_mpc.study.episodes import EXACT, Spread, run_episode
-from pcr_mpc.study.parallel import collect, finished, local_workers
-from pcr_mpc.study.provenance import described, differences
+from pcr_mpc.study.episodes.episodes import EXACT, Spread, run_episode
+from pcr_mpc.study.episodes.parallel import collect, finished, local_workers
+from pcr_mpc.study.episodes.provenance import described, differences
 from tests.conftest import MODELS, ROOT
 
 SETTINGS = {"scene": {"mass": 0.25, "rods": [1.0, 2.0]}}
@@ -155,7 +155,7 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_workers(how, tmp_p
     path = tmp_path / "rows.jsonl"
     script = f"""
 import pathlib, signal
-from pcr_mpc.study.parallel import collect, local_workers
+from pcr_mpc.study.episodes.parallel import collect, local_workers
 from tests.study.test_parallel import SETTINGS, slow
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -9,15 +9,16 @@ import pytest
 from pcr_mpc import load_scene
 from pcr_mpc.errors import ModelError
 from pcr_mpc.loop.scene.settings import PlantSettings
-from pcr_mpc.study import choice as choosing
-from pcr_mpc.study import episodes, tuning_score
-from pcr_mpc.study.choice import Bench, Choice, Measured
-from pcr_mpc.study.chosen_rung import write_rung
-from pcr_mpc.study.episodes import EXACT, Mismatch, Spread, run_episode
-from pcr_mpc.study.estimates import Estimate, Estimates
-from pcr_mpc.study.provenance import differences
-from pcr_mpc.study.rungs import all_physics, ladders
-from pcr_mpc.study.tuning_score import Costs
+from pcr_mpc.study.choice import choice as choosing
+from pcr_mpc.study.choice.choice import Bench, Choice, Measured
+from pcr_mpc.study.choice.estimates import Estimate, Estimates
+from pcr_mpc.study.choice.file import write_rung
+from pcr_mpc.study.choice.rungs import all_physics, ladders
+from pcr_mpc.study.episodes import episodes
+from pcr_mpc.study.episodes.episodes import EXACT, Mismatch, Spread, run_episode
+from pcr_mpc.study.episodes.provenance import differences
+from pcr_mpc.study.tuning import score as tuning_score
+from pcr_mpc.study.tuning.score import Costs
 from tests.conftest import CONTROLLERS, MODELS
 
 SCENES = MODELS / "scenes"

@@ -13,10 +13,10 @@ from pcr_mpc.errors import CompilerError
 from pcr_mpc.loop.controller.tracking import TrackingController
 from pcr_mpc.loop.parts.controllers import Decision
 from pcr_mpc.report.timing import timing_tables
-from pcr_mpc.study import timing
-from pcr_mpc.study.episodes import Spread
-from pcr_mpc.study.stopwatch import WARM_UP
-from pcr_mpc.study.tuning_score import Costs
+from pcr_mpc.study.episodes.spread import Spread
+from pcr_mpc.study.timing import timing
+from pcr_mpc.study.timing.stopwatch import WARM_UP
+from pcr_mpc.study.tuning.score import Costs
 from tests.conftest import CONTROLLERS, MODELS
 
 from .test_parallel import Here
@@ -145,7 +145,8 @@ def test_each_method_is_called_as_often_as_is_said_and_has_its_error(monkeypatch
 def test_the_sampler_has_the_seed_of_the_search(scene, tmp_path, monkeypatch):
     """Another seed, other trials; that the same gives the same is tested elsewhere."""
     pytest.importorskip("optuna")
-    from pcr_mpc.study import tuning_space, tuning_study
+    from pcr_mpc.study.tuning import space as tuning_space
+    from pcr_mpc.study.tuning import study as tuning_study
 
     monkeypatch.setattr(tuning_study, "measure", lambda *_, **__: Costs(1.0, 0.1, 10.0, 100.0, 1.0, 0.0, 0.0))
     monkeypatch.setattr(tuning_study, "guesses", lambda search: [])
@@ -160,7 +161,7 @@ def test_the_sampler_has_the_seed_of_the_search(scene, tmp_path, monkeypatch):
 
 def test_episodes_of_a_search_are_its_own(scene):
     pytest.importorskip("optuna")
-    from pcr_mpc.study.tuning_space import Search
+    from pcr_mpc.study.tuning.space import Search
 
     search = Search(scene, Spread(), 3, 10, "")
     assert list(search.seeds) == [10, 11, 12]
@@ -171,7 +172,7 @@ def test_episodes_of_a_search_are_its_own(scene):
 
 def test_parameters_become_tunings_of_three_digits_and_back(scene):
     pytest.importorskip("optuna")
-    from pcr_mpc.study.tuning_space import Search, candidate, parameters, space
+    from pcr_mpc.study.tuning.space import Search, candidate, parameters, space
 
     search = Search(scene, Spread(), 3, 0, "")
     params = {**parameters(search, search.start), "input_weight": 0.0123456, "velocity_weight": 1.23456,

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pcr_mpc.errors import StudyError
-from pcr_mpc.study import provenance
-from pcr_mpc.study.parallel import collect, finished, local_workers
-from pcr_mpc.study.stopwatch import distribution
-from pcr_mpc.study.tuning_score import Costs, score
+from pcr_mpc.study.episodes import provenance
+from pcr_mpc.study.episodes.parallel import collect, finished, local_workers
+from pcr_mpc.study.timing.stopwatch import distribution
+from pcr_mpc.study.tuning.score import Costs, score
 
 from .test_parallel import Here
 

@@ -17,10 +17,12 @@ from pcr_mpc import PCRError, load_scene, load_tuning
 from pcr_mpc.cli import main
 from pcr_mpc.errors import StudyError
 from pcr_mpc.report.trade_off import pareto
-from pcr_mpc.study import tuning_score, tuning_space, tuning_study
-from pcr_mpc.study.episodes import EXACT, Spread
-from pcr_mpc.study.tuning_file import default_path, to_tune, write_tuning
-from pcr_mpc.study.tuning_score import Costs, measure, score
+from pcr_mpc.study.episodes.episodes import EXACT, Spread
+from pcr_mpc.study.tuning import score as tuning_score
+from pcr_mpc.study.tuning import space as tuning_space
+from pcr_mpc.study.tuning import study as tuning_study
+from pcr_mpc.study.tuning.file import default_path, to_tune, write_tuning
+from pcr_mpc.study.tuning.score import Costs, measure, score
 from tests.conftest import CONTROLLERS, MODELS
 
 from .test_parallel import Here

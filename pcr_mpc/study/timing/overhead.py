@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from .. import interrupt
-from ..buffered import BufferedFunction
-from ..compiled import has_compiler
-from ..errors import CompilerError
-from ..plant.motion.plant import Plant
-from ..plant.motion.rollout import rollout
-from ..plant.motion.step_graph import step_function
-from ..plant.robot import Robot
-from ..plant.statics.equilibrium import Equilibrium
+from ... import interrupt
+from ...buffered import BufferedFunction
+from ...compiled import has_compiler
+from ...errors import CompilerError
+from ...plant.motion.plant import Plant
+from ...plant.motion.rollout import rollout
+from ...plant.motion.step_graph import step_function
+from ...plant.robot import Robot
+from ...plant.statics.equilibrium import Equilibrium
 
 _BATCHES, _CALLS = 15, 400
 _ROLLED, _ROLLOUTS = 2000, 6

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import PCRError
-from ..loop.run.run import Run
-from ..plant.motion.plant import Plant
-from ..plant.motion.rollout import rollout
-from ..plant.motion.sensitivities import sensitivities
-from ..plant.robot import Robot
-from ..plant.statics.held_tip import default_method
-from ..plant.uncertainty import Uncertainty
-from .identification.parameters import DEFAULT, catalogue, robot_with
-from .identification.result import belongs_to_robot
-from .scatter import drawn, is_place, numbers_about
+from ...errors import PCRError
+from ...loop.run.run import Run
+from ...plant.motion.plant import Plant
+from ...plant.motion.rollout import rollout
+from ...plant.motion.sensitivities import sensitivities
+from ...plant.robot import Robot
+from ...plant.statics.held_tip import default_method
+from ...plant.uncertainty import Uncertainty
+from ..episodes.scatter import drawn, is_place, numbers_about
+from ..identification.parameters import DEFAULT, catalogue, robot_with
+from ..identification.result import belongs_to_robot
 
 # Steps of RK4 in radians of the tip's fastest swing; robots that are sampled, and how many of them must get to the end.
 _SWING, _SAMPLES, _ARRIVED = 0.2, 48, 0.5

@@ -6,12 +6,12 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..control.tuning import Tuning, load_tuning
-from ..errors import ModelError, StudyError
-from ..files import replacing, require_free, stamped
-from ..loop.scene.file import load_scene
-from ..loop.scene.scene import Scene
-from ..toml_table import read_toml
+from ...control.tuning import Tuning, load_tuning
+from ...errors import ModelError, StudyError
+from ...files import replacing, require_free, stamped
+from ...loop.scene.file import load_scene
+from ...loop.scene.scene import Scene
+from ...toml_table import read_toml
 
 
 def default_path(scene_file: Path, name: str) -> Path:

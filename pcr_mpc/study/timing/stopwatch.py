@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from .. import interrupt
+from ... import interrupt
 
 # Calls that are reported apart and belong to no percentile: caches fill, branches are learnt, memory is mapped.
 WARM_UP = 20

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import PCRError
-from ..loop.hardware.motors import Motors
-from ..loop.scene.scene import Scene
-from ..loop.scene.settings import PlantSettings
-from ..plant.motion.plant import Plant
-from ..plant.rod import Rod
-from ..plant.statics.equilibrium import Equilibrium
-from ..plant.statics.free_tip import inverse_statics
-from ..plant.statics.held_tip import solve_statics
+from ...errors import PCRError
+from ...loop.hardware.motors import Motors
+from ...loop.scene.scene import Scene
+from ...loop.scene.settings import PlantSettings
+from ...plant.motion.plant import Plant
+from ...plant.rod import Rod
+from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.free_tip import inverse_statics
+from ...plant.statics.held_tip import solve_statics
 from .rungs import levels
 
 _POSES = 9  # along the motion

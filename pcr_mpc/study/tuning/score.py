@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from ..control.tuning import Tuning
-from ..errors import MarginsError
-from ..loop.scene.scene import Scene
-from .episodes import Row, run_episode
-from .margins.predicted import LONGEST, predict_delay_margin
-from .spread import EXACT, Spread
+from ...control.tuning import Tuning
+from ...errors import MarginsError
+from ...loop.scene.scene import Scene
+from ..episodes.episodes import Row, run_episode
+from ..episodes.spread import EXACT, Spread
+from ..margins.predicted import LONGEST, predict_delay_margin
 
 # What each cost counts for, as a ratio to that of the start, and below which value it is not worth lowering: a camera
 # does not see errors below 10 um; without mismatch the figure is the model's, and 2 um are wanted of it.

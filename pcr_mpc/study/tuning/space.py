@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from ..control.tuning import LINEARISE, Tuning
-from ..errors import PCRError
-from ..loop.scene.checks import is_multiple
-from ..loop.scene.scene import Scene
-from .spread import Spread
+from ...control.tuning import LINEARISE, Tuning
+from ...errors import PCRError
+from ...loop.scene.checks import is_multiple
+from ...loop.scene.scene import Scene
+from ..episodes.spread import Spread
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution

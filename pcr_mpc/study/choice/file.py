@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import ModelError
-from ..files import replacing
-from ..loop.run.finding import digest
-from ..loop.scene.file import load_scene
-from ..loop.scene.settings import PlantSettings
+from ...errors import ModelError
+from ...files import replacing
+from ...loop.run.finding import digest
+from ...loop.scene.file import load_scene
+from ...loop.scene.settings import PlantSettings
 from .choice import Choice
 from .rungs import ladders, named
 

@@ -9,15 +9,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from tqdm import tqdm
 
-from .. import interrupt
-from ..errors import NoRungError, PCRError, SimulationError
-from ..loop.controller.make_controller import make_controller
-from ..loop.parts.controllers import Replay
-from ..loop.run.run import Run
-from ..loop.run.simulate import simulate
-from ..loop.scene.scene import Scene
-from ..loop.scene.settings import Need, PlantSettings
-from ..plant.uncertainty import Uncertainty
+from ... import interrupt
+from ...errors import NoRungError, PCRError, SimulationError
+from ...loop.controller.make_controller import make_controller
+from ...loop.parts.controllers import Replay
+from ...loop.run.run import Run
+from ...loop.run.simulate import simulate
+from ...loop.scene.scene import Scene
+from ...loop.scene.settings import Need, PlantSettings
+from ...plant.uncertainty import Uncertainty
 from .estimates import Estimate, Estimates
 from .numbers_cost import NumbersCost, numbers_cost
 from .rungs import all_physics, discretisations, height, named

@@ -9,20 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tqdm import tqdm
 
-from .. import interrupt
-from ..errors import IdentificationError, PCRError, checked_integer, checked_number
-from ..frozen import Frozen
-from ..loop.demand.feasibility import reference_of
-from ..loop.demand.feed_forward import InverseDynamics, feed_forward
-from ..loop.demand.slowing import Slowed
-from ..loop.references.trajectory import Lemniscate, Trajectory, smooth_step
-from ..loop.scene.scene import Scene
-from ..plant.uncertainty import Uncertainty
-from .identification.information import information
-from .identification.log import Log
-from .identification.parameters import catalogue, chosen
-from .identification.prediction import Piece, Predictor, physics
-from .identification.problem import Guess, Noise, Problem
+from ... import interrupt
+from ...errors import IdentificationError, PCRError, checked_integer, checked_number
+from ...frozen import Frozen
+from ...loop.demand.feasibility import reference_of
+from ...loop.demand.feed_forward import InverseDynamics, feed_forward
+from ...loop.demand.slowing import Slowed
+from ...loop.references.trajectory import Lemniscate, Trajectory, smooth_step
+from ...loop.scene.scene import Scene
+from ...plant.uncertainty import Uncertainty
+from ..identification.information import information
+from ..identification.log import Log
+from ..identification.parameters import catalogue, chosen
+from ..identification.prediction import Piece, Predictor, physics
+from ..identification.problem import Guess, Noise, Problem
 
 # Sensors where the scene has none: a camera of 0.05 mm, encoders of 12 bits.
 _TIP_NOISE, _ANGLE_STEP = 5e-5, 2.0 * math.pi / 4096

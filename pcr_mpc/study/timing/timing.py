@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from .. import interrupt
-from ..compiled import has_compiler
-from ..errors import PCRError
-from ..loop.controller.make_controller import make_controller
-from ..loop.controller.tracking import TrackingController
-from ..loop.demand.feed_forward import feed_forward
-from ..loop.run.run import Run
-from ..loop.run.simulate import simulate
-from ..loop.scene.scene import Scene
-from ..methods import METHODS
-from ..plant.motion.followed_rods import DERIVATIVE_ACCURACY
-from ..plant.motion.plant import Plant
+from ... import interrupt
+from ...compiled import has_compiler
+from ...errors import PCRError
+from ...loop.controller.make_controller import make_controller
+from ...loop.controller.tracking import TrackingController
+from ...loop.demand.feed_forward import feed_forward
+from ...loop.run.run import Run
+from ...loop.run.simulate import simulate
+from ...loop.scene.scene import Scene
+from ...methods import METHODS
+from ...plant.motion.followed_rods import DERIVATIVE_ACCURACY
+from ...plant.motion.plant import Plant
 from .machine import machine, versions
 from .overhead import call_overhead
 from .stopwatch import WARM_UP, Times, distribution, measure

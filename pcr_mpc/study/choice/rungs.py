@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import product
 
-from ..loop.hardware.motors import IDEAL
-from ..loop.scene.scene import Scene
-from ..loop.scene.settings import MOTORS, PAYLOADS, RODS, PlantSettings
-from ..plant.rods.inertia import INERTIAS
-from ..plant.statics.weight import WEIGHTS
+from ...loop.hardware.motors import IDEAL
+from ...loop.scene.scene import Scene
+from ...loop.scene.settings import MOTORS, PAYLOADS, RODS, PlantSettings
+from ...plant.rods.inertia import INERTIAS
+from ...plant.statics.weight import WEIGHTS
 
 # Steps in a control period: some, for what happens within it, such as a late decision. Force evaluations a step, which
 # is what a step costs.

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from ..control.tuning import Tuning
-from ..errors import PCRError, StudyError
-from .parallel import as_finished, finished
-from .provenance import described, differences
-from .tuning_score import Costs, measure, score
-from .tuning_space import Search, candidate, guesses, parameters, space
+from ...control.tuning import Tuning
+from ...errors import PCRError, StudyError
+from ..episodes.parallel import as_finished, finished
+from ..episodes.provenance import described, differences
+from .score import Costs, measure, score
+from .space import Search, candidate, guesses, parameters, space
 
 if TYPE_CHECKING:
     from optuna import Study, Trial

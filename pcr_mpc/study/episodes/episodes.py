@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from .. import interrupt
-from ..control.tuning import Tuning
-from ..errors import SimulationError, checked_integer
-from ..loop.controller.make_controller import make_controller
-from ..loop.controller.own_controller import built
-from ..loop.demand.feed_forward import InverseDynamics, feed_forward
-from ..loop.parts.controllers import Controller
-from ..loop.references.reading import built_in
-from ..loop.references.trajectory import Trajectory, sampled
-from ..loop.run.run import Run
-from ..loop.run.simulate import simulate
-from ..loop.scene.scene import Scene
+from ... import interrupt
+from ...control.tuning import Tuning
+from ...errors import SimulationError, checked_integer
+from ...loop.controller.make_controller import make_controller
+from ...loop.controller.own_controller import built
+from ...loop.demand.feed_forward import InverseDynamics, feed_forward
+from ...loop.parts.controllers import Controller
+from ...loop.references.reading import built_in
+from ...loop.references.trajectory import Trajectory, sampled
+from ...loop.run.run import Run
+from ...loop.run.simulate import simulate
+from ...loop.scene.scene import Scene
 from .spread import ASSUMED, EXACT, Mismatch, Spread
 
 __all__ = ["ASSUMED", "EXACT", "Mismatch", "Spread", "lighter", "run_episode", "simulate_episode"]

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import checked_integer, checked_number
-from ..loop.hardware.motors import Motors
-from ..loop.scene.scene import Scene
-from ..plant.robot import Robot
-from ..plant.uncertainty import Uncertainty
+from ...errors import checked_integer, checked_number
+from ...loop.hardware.motors import Motors
+from ...loop.scene.scene import Scene
+from ...plant.robot import Robot
+from ...plant.uncertainty import Uncertainty
 from .scatter import drawn, numbers_about
 
 Row = dict[str, Any]

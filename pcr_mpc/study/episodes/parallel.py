@@ -21,9 +21,9 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from .. import interrupt
-from ..errors import StudyError
-from ..files import write_text
+from ... import interrupt
+from ...errors import StudyError
+from ...files import write_text
 from .provenance import differences
 
 Row = dict[str, Any]

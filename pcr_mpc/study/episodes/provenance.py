@@ -9,11 +9,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ..control.tuning import Tuning
-from ..loop.controller.own_controller import OwnController
-from ..loop.run.finding import own_motion
-from ..loop.scene.scene import Scene
-from ..plain import plain
+from ...control.tuning import Tuning
+from ...loop.controller.own_controller import OwnController
+from ...loop.run.finding import own_motion
+from ...loop.scene.scene import Scene
+from ...plain import plain
 from .episodes import Maker
 from .spread import Spread
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import ModelError
-from ..files import stamped, write_text
-from ..loop.scene.file import load_scene
-from .excitation import Excitation
+from ...errors import ModelError
+from ...files import stamped, write_text
+from ...loop.scene.file import load_scene
+from .design import Excitation
 
 PATH = "excited.csv"
 SCENE = "excited.toml"

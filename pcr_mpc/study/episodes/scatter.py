@@ -7,9 +7,9 @@ import re
 
 import numpy as np
 
-from ..errors import ModelError
-from ..plant.robot import Robot
-from ..plant.uncertainty import Uncertainty
+from ...errors import ModelError
+from ...plant.robot import Robot
+from ...plant.uncertainty import Uncertainty
 
 _OF_ROD = ("bending_stiffness", "length", "base_x", "base_y", "line_density")
 _OF_ROBOT = ("tip_mass", "drag")

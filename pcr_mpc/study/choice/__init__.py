@@ -1,0 +1,1 @@
+"""Which model is enough for a scene, and what better numbers would be worth."""
