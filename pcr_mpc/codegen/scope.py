@@ -13,7 +13,7 @@ from ..loop.scene.scene import Scene
 _KNOWN = {
     "scene": "name robot duration start_tip start_motors start_mode start_velocity trajectory plant period tuning "
     "force tip_noise angle_step delay deadline late pose_limits payload need finding own_period wrapped tracking_error "
-    "untold_delay motors",
+    "untold_delay motors camera",
     "tuning": "name horizon position_weight velocity_weight angle_weight input_weight tolerance max_iterations "
     "fallback model observer law pd period solver",
     "model": "method segments steps scheme inertia linearise payload predict_delay compiled angles motor_lag",
@@ -57,9 +57,11 @@ def _choices(scene: Scene, tuning: Tuning) -> list[tuple[str, Any, tuple[Any, ..
         ("inertia of the plant", plant.inertia, ("none", "constant", "condensed"), "set [plant] inertia"),
         ("plant that carries a payload with inertia", carrying, ("none", "constant"), "set [plant] inertia"),
         ("snapping plant", plant.on_snap, ("raise",), "set [plant] on_snap"),
-        ("motors that do not follow at once", scene.motors, (None,), "leave [motors] out"),
-        ("camera that is late or rare", scene.camera, (None,), "leave latency, every and lost out of [sensor]"),
-        ("latency of the tip [s]", tuning.observer.latency if tuning.observer else 0.0, (0.0,), other),
-        ("untold delay [s]", scene.untold_delay, (0.0,), "leave [control] untold_delay out"),
+        (
+            "motors at their torque limit",
+            bool(scene.motors and scene.motors.saturated and plant.motors != "ideal"),
+            (False,),
+            "leave [motors] saturated out",
+        ),
         ("start that moves, at [m/s]", tuple(scene.start_velocity), ((0.0, 0.0),), "start at rest"),
     ]

@@ -15,6 +15,7 @@ from ..loop.controller.control_step import ControlStep
 from ..loop.controller.make_controller import make_controller
 from ..loop.controller.tracking import TrackingController
 from ..loop.parts.assembled import resting_model, resting_state
+from ..loop.run.drive import drive_of
 from ..loop.scene.scene import Scene
 from ..plant.motion.plant import Plant
 from ..plant.motion.step_graph import StepModel
@@ -117,6 +118,11 @@ class Subject:
     def limited(self) -> list[Shape]:
         """Of the QPs with soft rows, by the bits of the kinds that are near."""
         return limited_shapes(self.tuning.horizon, self.robot.n_rods, list(self.kinds.values()))
+
+    @property
+    def drives(self) -> bool:
+        """Whether the motors do not follow at once."""
+        return drive_of(self.scene, self.plant.dt, self.pose) is not None
 
     @property
     def plant_as_model(self) -> bool:

@@ -13,7 +13,10 @@ from ..control.qp import stage_weights
 from ..errors import GenerationError
 from ..linearisation.model_graph import sizes
 from ..linearisation.strain_watch import strain_graphs
+from ..loop.hardware.camera import IDEAL as NO_CAMERA
+from ..loop.hardware.lag import Lag
 from ..loop.parts.assembled import tip_noise
+from ..loop.run.untold_delay import UntoldDelay
 from ..plant.motion.step_graph import StepModel
 from ..plant.motion.step_graph import limits as step_limits
 from ..plant.rods.chart import critical_load_table
@@ -125,8 +128,10 @@ def config(subject: Subject) -> str:
         "PCR_PLANT_AS_MODEL": int(subject.plant_as_model),
         "PCR_PLANT_NUMBERS": of_plant.kind.size,
         "PCR_PLANT_TIP_MASS": of_plant.kind.names.index("tip_mass"),
+        "PCR_PLANT_ROD_NUMBERS": of_plant.kind.names.index("rods[1].bending_stiffness"),
         "PCR_PLANT_START": of_plant.widths[0],
-    }  # fmt: skip
+    }
+    values |= _hardware(subject)
     values["PCR_PHYSICS"] = watched.kind.layout.size if watched.kind.layout is not None else 0
     if watched.kind.layout is not None:
         strain = strain_graphs(watched.kind, _width(watched) // 4)
@@ -149,6 +154,31 @@ def config(subject: Subject) -> str:
         f"/* Sizes and settings of the controller {tuning.name!r} of the scene {scene.name!r}. */\n"
         f"#ifndef PCR_CONFIG_H\n#define PCR_CONFIG_H\n\n{defines(values)}\n#endif\n"
     )
+
+
+def _hardware(subject: Subject) -> dict[str, Any]:
+    """Macros of sensors and motors that are late: what the controller knows of them, then what plant and example do."""
+    scene, dt = subject.scene, subject.plant.dt
+    camera = scene.camera or NO_CAMERA
+    observer = subject.tuning.observer
+    age = 0.0 if observer is None else observer.latency / scene.period
+    motors = scene.motors if subject.drives else None
+    lag = Lag.of(motors.time_constant if motors else 0.0, dt)
+    untold = UntoldDelay(scene.untold_delay, dt, subject.robot.n_rods)
+    return {
+        "PCR_EVERY": camera.every,
+        "PCR_PAST": math.ceil(age - 1e-9) or 1 if age > 0.0 else 0,
+        "PCR_PAST_AGE": age,
+        "PCR_MOTORS": int(motors is not None),
+        "PCR_MOTOR_LAG": motors.time_constant if motors else 0.0,
+        "PCR_MOTOR_MEAN": lag.mean,
+        "PCR_MOTOR_LEFT": lag.left,
+        "PCR_MOTOR_PLAY": motors.backlash / 2 if motors else 0.0,
+        "PCR_MOTOR_ANGLES": int(motors is not None and motors.command == "angle"),
+        "PCR_PICTURE_AGE": camera.latency / dt,
+        "PCR_WAITING": untold.steps + (untold.fraction > 0.0),
+        "PCR_WITHIN": untold.fraction,
+    }
 
 
 def _width(model: StepModel) -> int:

@@ -55,6 +55,7 @@ def vectors(subject: Subject, run: Run) -> str:
             f"/* The scene {scene.name!r} as Python ran it, with seed {run.seed}. */\n"
             '#include "pcr_vectors.h"\n\n#include <math.h>\n',
             array("double", "pcr_vector_noise", noise),
+            array("unsigned char", "pcr_vector_seen", np.isfinite(run.measured[:, 0]).astype(int)),
             array("double", "pcr_vector_measured", run.measured),
             array("double", "pcr_vector_u", run.u),
             array("unsigned char", "pcr_vector_rung", rungs_of(run)),

@@ -19,9 +19,13 @@ from pcr_mpc.codegen.solver import flops
 from pcr_mpc.codegen.subject import Subject
 from pcr_mpc.codegen.tables import parameters
 from pcr_mpc.codegen.timing import time_in_c, worst_case
-from pcr_mpc.control.tuning import load_tuning
+from pcr_mpc.codegen.vectors import recorded
+from pcr_mpc.control.observer import ObserverTuning
+from pcr_mpc.control.tuning import LearningTuning, load_tuning
 from pcr_mpc.errors import GenerationError, PCRError
 from pcr_mpc.loop.controller.make_controller import make_controller
+from pcr_mpc.loop.hardware.camera import Camera
+from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.scene.file import load_scene
 from tests.conftest import ROOT
 
@@ -84,6 +88,7 @@ def test_the_lemniscate_runs_in_c_as_it_does_in_python(lemniscate):
     assert len(differences) == 2
     assert max(differences) <= 1e-9
     assert said.count("rung or iterations in 0 of 600 periods") == 2
+    assert "plant, recorded rates       differs by at most 0 m" in said
 
 
 @needs_compiler
@@ -125,6 +130,26 @@ def side_by_side(scene, folder, seconds):
 def test_a_motor_target_that_is_shot_follows_in_c(tmp_path):
     # Three kinds of rods with different numbers: a model with weight by its potential, a target that sags, plain ones.
     side_by_side(load_scene(SCENES / "heavy_rods.toml"), tmp_path, 1.0)
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_what_is_late_in_the_loop_is_late_in_c(tmp_path):
+    # Servos with lag and play, pictures that are old, rare and sometimes lost, commands that come within a step.
+    scene = replace(
+        load_scene(SCENES / "servo.toml"),
+        duration=0.8,
+        motors=Motors(time_constant=0.015, backlash=0.01, command="angle"),
+        camera=Camera(latency=0.0133, every=2, lost=0.2),
+        untold_delay=0.0037,
+        delay=1,
+    )
+    scene = scene.tuned(replace(scene.tuning, model=replace(scene.tuning.model, compiled=False)))
+    subject = Subject.of_scene(scene)
+    write_folder(subject, recorded(subject), tmp_path)
+    said = run(make(tmp_path, *QUICK))
+    assert said.count("rung or iterations in 0 of 80 periods") == 2
+    assert "plant, recorded rates       differs by at most 0 m" in said
 
 
 @needs_compiler
@@ -299,7 +324,7 @@ def test_nothing_of_the_library_allocates_or_prints(each, tmp_path):
     assert not variables  # state is in the structures alone
 
 
-NOT_IN_C = {"release": "reference", "servo": "motors that do not follow at once"}
+NOT_IN_C = {"release": "reference"}
 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.toml")), ids=lambda path: path.stem)
@@ -314,12 +339,34 @@ def test_every_shipped_scene_is_generated_or_refused_by_name(path):
 
 
 REFUSED = {
-    "known_lag": "latency of the tip [s]",
     "lqr": "law",
     "nonlinear": "law",
     "open_loop": "law",
     "pd": "law",
 }
+
+
+@pytest.mark.parametrize(
+    ("changes", "part"),
+    [
+        ({"motors": Motors(saturated=True)}, "motors at their torque limit"),
+        ({"plant": {"on_snap": "jump"}}, "snapping plant"),
+        ({"plant": {"method": "single_shooting"}}, "method of the plant's rods"),
+        ({"plant": {"inertia": "full"}}, "inertia of the plant"),
+        ({"tuning": {"fallback": "raise"}}, "fallback"),
+        ({"tuning": {"learning": LearningTuning()}}, "learning"),
+        ({"tuning": {"observer": ObserverTuning(adapts=("tip_mass",))}}, "observer that adapts"),
+        ({"start_velocity": (0.1, 0.0)}, "start that moves, at [m/s]"),
+    ],
+)
+def test_what_c_does_not_have_is_said_by_name(changes, part):
+    scene = load_scene(SCENES / "lemniscate.toml")
+    whole = {key: replace(getattr(scene, key), **value) if isinstance(value, dict) else value
+             for key, value in changes.items()}  # fmt: skip
+    scene = replace(scene, **whole)
+    with pytest.raises(GenerationError, match="C has no") as error:
+        check_scope(scene, scene.tuning)
+    assert error.value.part == part
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "controllers").glob("*.toml")), ids=lambda path: path.stem)

@@ -91,7 +91,7 @@ typedef struct {
 } pcr_pose;
 
 typedef struct {
-    double p[2];            /* tip [m] */
+    double p[2];            /* tip [m]; NaN: none has come */
     double v[2];            /* its velocity [m/s]; only where there is no observer */
     double q[PCR_N];        /* motor angles [rad] */
     const double *window;   /* reference: PCR_HORIZON rows of PCR_ROW, as README.md has it; NULL: the scene's table */
@@ -134,7 +134,9 @@ typedef struct {
     double *res[PCR_RES];
     int iw[PCR_IW];
     pcr_sensor tip, encoders;
-    int first;
+    int first, without;                                     /* periods since a tip came last */
+    int past_count;
+    double past[PCR_PAST + 1][6], past_moves[PCR_PAST + 1][4][6]; /* [p, v, force], and by what it moves in a period */
     double before[PCR_N];                                   /* angles that were believed last */
     double on_the_way[PCR_DELAY + 1][PCR_N], u[PCR_N], turning[PCR_N];
     double predicts[PCR_MODEL];
@@ -150,10 +152,16 @@ typedef struct {
     pcr_limited limited;
 } pcr_controller;
 
+/* Motors that do not follow at once: how fast they turn, where their shafts are, and are told to be. */
+typedef struct {
+    double rate[PCR_N], shaft[PCR_N], wanted[PCR_N];
+} pcr_drive;
+
 typedef struct {
     int started, corrections; /* Newton iterations of the last step */
     double x[PCR_STATES];     /* [p, v, q] in [m, m/s, rad] */
     double memory[PCR_PLANT_MEMORY], next[PCR_PLANT_MEMORY], numbers[PCR_PLANT_NUMBERS];
+    pcr_drive drive;
     double tip_mass, payload; /* of the empty tip, and what it carries [kg]; change it by pcr_plant_carry */
     double w[PCR_PLANT_W];
     const double *arg[PCR_PLANT_ARG];
@@ -188,6 +196,9 @@ pcr_result pcr_plant_carry(pcr_plant *plant, double payload);
 /* Let the robot have other numbers, as listed in README.md, in the same state; of the plants that pcr_plant_init knows
    elsewhere. Where it returns PCR_OUT_OF_REACH the plant is as it was. */
 pcr_result pcr_plant_set_numbers(pcr_plant *plant, const double *numbers);
+
+/* Motor angles as encoders see them [rad]: those of the clamps, plant->x + 4, unless the motors have play. */
+pcr_result pcr_plant_angles(const pcr_plant *plant, double *q);
 
 /* PCR_OK if the plant has a state, which is in plant->x. */
 pcr_result pcr_plant_status(const pcr_plant *plant);

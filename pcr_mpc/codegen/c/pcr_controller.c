@@ -374,6 +374,9 @@ pcr_result pcr_controller_step(pcr_controller *c, const pcr_measurement *measure
             output->states[k][i] = c->has_states ? c->states[k][i] : NAN;
         }
     }
+    if (PCR_PAST) {
+        pcr_past_remember(c, corrected, c->predicts);
+    }
     memcpy(in + PCR_IN_ESTIMATE, foreseen, sizeof foreseen);
     memcpy(in + PCR_IN_ESTIMATE + PCR_STATES, corrected + PCR_STATES, 2 * sizeof *in);
     c->period += c->period < PCR_PERIODS + PCR_PAYLOAD_ROWS;

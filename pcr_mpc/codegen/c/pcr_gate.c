@@ -104,6 +104,8 @@ void pcr_gate_start(pcr_controller *controller, const double *q)
     memset(&controller->encoders, 0, sizeof controller->encoders);
     memcpy(controller->before, q, sizeof controller->before);
     controller->first = 1;
+    controller->without = 0;
+    pcr_past_clear(controller);
 }
 
 static double unwrapped(double angle, double expected)
@@ -115,17 +117,28 @@ pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measur
 {
     double *expected = controller->in + PCR_IN_ESTIMATE, *given = controller->in + PCR_IN_MEASURED;
     const double turn = TURN_IN_A_PERIOD(controller);
-    double due[PCR_STATES], told[PCR_STATES], velocity[2];
+    double due[PCR_STATES], told[PCR_STATES], velocity[2], then[2];
     memcpy(due, expected, sizeof due);
     memcpy(told, measured->p, 2 * sizeof *told);
+    if (PCR_PAST) {
+        /* As far from where it is expected as it was from where it was when the picture was taken. */
+        double now[PCR_STATES + 2];
+        memcpy(now, expected, sizeof now);
+        pcr_past_tip(controller, now, then);
+        told[0] += due[0] - then[0];
+        told[1] += due[1] - then[1];
+    }
     memcpy(told + 2, measured->v, 2 * sizeof *told);
     for (int i = 0; i < PCR_N; i++) {
         told[4 + i] = PCR_WRAPPED ? unwrapped(measured->q[i], due[4 + i]) : measured->q[i];
     }
     const oddity about_angles = odd_angles(controller, told + 4), about_tip = odd_tip(controller, told, due);
     int tip = about_tip == ODD_NOT, angles = about_angles == ODD_NOT, moved = 0;
+    controller->without = isnan(told[0]) ? controller->without + 1 : 0;
+    /* That there is no tip between two pictures is no news. */
+    const int is_due = !(controller->without > 0 && controller->without < PCR_EVERY);
     *doubts = 0;
-    if (controller->first && (about_tip == ODD_UNITS || about_angles == ODD_UNITS)) {
+    if (controller->first && ((is_due && about_tip == ODD_UNITS) || about_angles == ODD_UNITS)) {
         return PCR_FIRST_MEASUREMENT;
     }
     if (angles) {
@@ -146,7 +159,9 @@ pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measur
         }
         *doubts |= angles ? PCR_DOUBT_ANGLES_INSIST : PCR_DOUBT_ANGLES;
     }
-    if (tip) {
+    if (!is_due) {
+        tip = 0;
+    } else if (tip) {
         believed(&controller->tip, hypot(told[0] - due[0], told[1] - due[1]));
     } else {
         const double before[2] = {controller->tip.last[0], controller->tip.last[1]};
@@ -155,8 +170,8 @@ pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measur
               && !too_far(controller, told, 0.0);
         if (tip) {
             moved = 1;
-            velocity[0] = (told[0] - before[0]) / PCR_PERIOD;
-            velocity[1] = (told[1] - before[1]) / PCR_PERIOD;
+            velocity[0] = (told[0] - before[0]) / (PCR_EVERY * PCR_PERIOD);
+            velocity[1] = (told[1] - before[1]) / (PCR_EVERY * PCR_PERIOD);
             believed(&controller->tip, near_tip(controller));
         }
         *doubts |= tip ? PCR_DOUBT_TIP_INSISTS : PCR_DOUBT_TIP;
@@ -177,6 +192,18 @@ pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measur
             memcpy(expected, told, 2 * sizeof *expected);
             expected[PCR_STATES] = expected[PCR_STATES + 1] = 0.0; /* no force is suspected */
         }
+        pcr_past_clear(controller);
+    } else if (PCR_PAST && tip) {
+        const double *gain = controller->parameters.observer_gain, away[2] = {told[0] - due[0], told[1] - due[1]};
+        double change[6];
+        for (int i = 0; i < 6; i++) {
+            change[i] = gain[i] * away[0] + gain[6 + i] * away[1];
+        }
+        pcr_past_correct(controller, change);
+        for (int i = 0; i < 6; i++) {
+            expected[i < 4 ? i : PCR_STATES + i - 4] += change[i];
+        }
+        tip = 0; /* it is done with */
     }
     memcpy(given, tip ? told : expected, 2 * sizeof *given);
     memcpy(given + 2, angles ? told + 4 : expected + 4, PCR_N * sizeof *given);

@@ -30,6 +30,17 @@ int pcr_met(const pcr_controller *controller, const double *u, const double *pre
 void pcr_gate_start(pcr_controller *controller, const double *q);
 pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measured, int *doubts);
 
+/* pcr_past.c: estimates of the last periods, where tips are late. Where the tip was when the picture was taken; what a
+   change of [p, v, force] at that time comes to now; and the estimate [x, force] of a period, with its linear model. */
+void pcr_past_clear(pcr_controller *controller);
+void pcr_past_tip(const pcr_controller *controller, const double *now, double *tip);
+void pcr_past_correct(pcr_controller *controller, double *change);
+void pcr_past_remember(pcr_controller *controller, const double *corrected, const double *model);
+
+/* pcr_drive.c: rates of the clamps at the angles q in a step of the plant, for commanded rates u. */
+void pcr_drive_start(pcr_drive *drive, const double *q);
+void pcr_drive_turn(pcr_drive *drive, const double *numbers, const double *q, const double *u, double *rates);
+
 /* pcr_rods.c: follow the rods from `record` to another pose. Returns 0 if they followed: `record` and `result` are then
    of that pose. `derivatives` is the residual at which derivatives may be taken. */
 typedef int pcr_graph(const double **arg, double **res, int *iw, double *w);

@@ -37,6 +37,7 @@ pcr_result pcr_plant_init(pcr_plant *plant, const pcr_pose *pose)
     memcpy(plant->numbers, pcr_scene_plant_numbers, sizeof plant->numbers);
     memcpy(plant->x, at->p, sizeof at->p);
     memcpy(plant->x + 4, at->q, sizeof at->q);
+    pcr_drive_start(&plant->drive, at->q);
     plant->tip_mass = plant->numbers[PCR_PLANT_TIP_MASS];
     if (pose != NULL) {
         for (int i = 0; i < PCR_STATES; i++) {
@@ -107,6 +108,12 @@ pcr_result pcr_plant_step(pcr_plant *plant, const double *u, const double *force
             return PCR_ARGUMENT;
         }
     }
+    const pcr_drive before = plant->drive;
+    if (PCR_MOTORS) {
+        double rates[PCR_N];
+        pcr_drive_turn(&plant->drive, plant->numbers, plant->x + 4, given, rates);
+        memcpy(given, rates, sizeof rates);
+    }
     for (int corrections = 1; corrections <= 2; corrections++) {
         plant->arg[0] = plant->memory;
         plant->arg[1] = plant->x;
@@ -133,6 +140,7 @@ pcr_result pcr_plant_step(pcr_plant *plant, const double *u, const double *force
             break; /* lost, not just unfinished */
         }
     }
+    plant->drive = before;
     return PCR_OUT_OF_REACH;
 }
 

@@ -5,6 +5,7 @@
 #include "pcr.h"
 
 extern const double pcr_vector_noise[PCR_PERIODS][2];        /* that was added to the measured tip [m] */
+extern const unsigned char pcr_vector_seen[PCR_PERIODS];      /* whether a tip came */
 extern const double pcr_vector_measured[PCR_PERIODS][PCR_STATES]; /* [p, v, q] */
 extern const double pcr_vector_u[PCR_PERIODS][PCR_N];        /* rates that were decided [rad/s] */
 extern const unsigned char pcr_vector_rung[PCR_PERIODS];     /* pcr_rung */
