@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .catalogue import shipped
+    from .control.motor_limits import Limits
     from .control.mpc import LinearMPC
     from .control.plan import Plan
     from .control.qp import QuadraticProgram, Reference, build_qp
-    from .control.tuning import Limits, Tuning, load_tuning
+    from .control.tuning import Tuning, load_tuning
     from .errors import (
         AmbiguousPoseError,
         CompilerError,
@@ -177,7 +178,8 @@ _WHERE = {
     "control.mpc": ("LinearMPC",),
     "control.plan": ("Plan",),
     "control.qp": ("QuadraticProgram", "Reference", "build_qp"),
-    "control.tuning": ("Limits", "Tuning", "load_tuning"),
+    "control.motor_limits": ("Limits",),
+    "control.tuning": ("Tuning", "load_tuning"),
     "errors": (
         "AmbiguousPoseError",
         "CompilerError",

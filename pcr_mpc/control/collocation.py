@@ -10,7 +10,8 @@ import numpy as np
 
 from ..buffered import building
 from ..frozen import Frozen
-from .tuning import Limits, Tuning, time_unit
+from .motor_limits import Limits
+from .tuning import Tuning, time_unit
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,11 @@ import numpy as np
 from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
+from .motor_limits import Limits
 from .mpc import lqr_rates, riccati
 from .plan import Plan
 from .qp import Reference
-from .tuning import Limits, Tuning
+from .tuning import Tuning
 
 
 class Law(Protocol):

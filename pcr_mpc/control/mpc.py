@@ -16,9 +16,10 @@ from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel, LinearModels
 from .condensing import condensing
+from .motor_limits import Limits
 from .plan import Plan
 from .qp import QuadraticProgram, Reference, assemble, model_sequence
-from .tuning import Limits, Tuning, time_unit
+from .tuning import Tuning, time_unit
 from .workspace import Workspace
 
 _NOT_OF_THE_PROBLEM = ("name", "fallback", "model", "observer", "pd", "period", "learning")  # fields of a tuning

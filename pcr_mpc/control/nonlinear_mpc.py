@@ -15,11 +15,12 @@ from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel
 from .collocation import Transcription, transcribe
+from .motor_limits import Limits
 from .mpc import terminal_weight
 from .nlp_solver import NLPSolution, NLPSolver, Point
 from .plan import Plan
 from .qp import Reference, model_sequence
-from .tuning import Limits, Tuning
+from .tuning import Tuning
 
 # Multiplier from which a limit counts as active; those of limits that are far are of the order of IPOPT's tolerance.
 _ACTIVE = 1e-4

@@ -14,7 +14,8 @@ from ..errors import checked_array, checked_vector
 from ..frozen import read_only
 from ..linearisation.linear_model import LinearModel, LinearModels
 from .condensing import condensing
-from .tuning import Limits, Tuning
+from .motor_limits import Limits
+from .tuning import Tuning
 
 
 @dataclass(frozen=True, eq=False)

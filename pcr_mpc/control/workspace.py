@@ -12,10 +12,11 @@ from ..linearisation.linear_model import LinearModel, LinearModels
 from .condensing import checking
 from .daqp_solver import DAQPSolver
 from .limited_qp import Limited, LimitedQP, active_of
+from .motor_limits import Limits
 from .osqp_solver import QPSolver
 from .qp import QuadraticProgram, constraint_matrix, motor_bounds
 from .qp_solver import Solution
-from .tuning import Limits, Tuning, time_unit
+from .tuning import Tuning, time_unit
 
 _RATES = ("rate", "rate change")
 _FEWEST_ITERATIONS = 10  # with which a solver is tried at all

@@ -12,7 +12,7 @@ import numpy as np
 from ..codegen.folder import write_folder
 from ..codegen.library import GeneratedController, build
 from ..codegen.subject import Subject
-from ..control.tuning import Limits
+from ..control.motor_limits import Limits
 from ..errors import GenerationError, PCRError
 from ..loop.controller.make_controller import make_controller
 from ..loop.controller.tracking import TrackingController

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pcr_mpc.control.tuning import Limits
+from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.errors import OutputError, PCRError
 from pcr_mpc.loop.parts.assembled import resting_state
 from pcr_mpc.loop.scene.file import load_scene

@@ -7,8 +7,8 @@ import pytest
 
 from pcr_mpc import ModelError, build_qp, load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.control.condensing import _UNROLLED
+from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
-from pcr_mpc.control.tuning import Limits
 from tests.conftest import CONTROLLERS, MODELS
 from tests.solvers.test_qp import DT, cost, full, model, problem  # noqa: F401  a fixture
 

@@ -15,10 +15,10 @@ from pcr_mpc import (
     simulate,
 )
 from pcr_mpc.control.limited_qp import LimitedQP
+from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
 from pcr_mpc.control.osqp_solver import QPSolver
 from pcr_mpc.control.qp import build_qp
-from pcr_mpc.control.tuning import Limits
 from tests.conftest import CONTROLLERS, MODELS
 
 DT, RATE, CHANGE = 0.01, 6.0, 1.0

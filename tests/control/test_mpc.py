@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from pcr_mpc import InfeasibleError, LinearMPC, Reference, load_tuning
-from pcr_mpc.control.tuning import Limits
+from pcr_mpc.control.motor_limits import Limits
 from tests.conftest import CONTROLLERS
 
 

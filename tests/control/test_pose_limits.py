@@ -20,9 +20,9 @@ from pcr_mpc import (
     solve_statics,
 )
 from pcr_mpc.control.limited_qp import LimitedQP
+from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
 from pcr_mpc.control.qp import Reference, build_qp
-from pcr_mpc.control.tuning import Limits
 from pcr_mpc.control.workspace import Check
 from pcr_mpc.linearisation.linear_limits import LinearLimits
 from pcr_mpc.linearisation.linear_model import LinearModels

@@ -8,8 +8,9 @@ import pytest
 
 from pcr_mpc import LinearModel, ModelError, Reference, Tuning, load_tuning
 from pcr_mpc.control.laws import LQR, PD, FeedForward
+from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.observer import DisturbanceObserver, ObserverTuning
-from pcr_mpc.control.tuning import Limits, Model
+from pcr_mpc.control.tuning import Model
 from tests.conftest import CONTROLLERS
 
 DT = 0.01

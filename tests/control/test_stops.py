@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcr_mpc.control.tuning import Limits
+from pcr_mpc.control.motor_limits import Limits
 
 DT = 0.01
 RATE, ACCELERATION = 6.0, 40.0

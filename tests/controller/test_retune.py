@@ -9,8 +9,8 @@ import pytest
 
 from pcr_mpc import LinearMPC, Reference, load_scene, load_tuning, make_controller
 from pcr_mpc.control.laws import LQR, PD, FeedForward
+from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.observer import ObserverTuning
-from pcr_mpc.control.tuning import Limits
 from pcr_mpc.errors import PCRError, ReadOnlyError
 from pcr_mpc.loop.parts.assembled import motor_limits
 from pcr_mpc.loop.parts.foresight import Foresight

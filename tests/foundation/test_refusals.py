@@ -38,7 +38,7 @@ def test_a_graph_with_memory_of_its_own_cannot_be_pickled():
 
 
 def test_a_nonlinear_mpc_cannot_be_pickled(pair, centre):
-    from pcr_mpc.control.tuning import Limits
+    from pcr_mpc.control.motor_limits import Limits
     from pcr_mpc.plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 
     hands, algebraic = rod_unknowns(pair, centre)

@@ -26,8 +26,8 @@ from pcr_mpc import (
     load_tuning,
     solve_statics,
 )
+from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.qp import Reference
-from pcr_mpc.control.tuning import Limits
 from tests.conftest import CONTROLLERS, MODELS
 
 from .rod_check import TOLERANCE, residuals

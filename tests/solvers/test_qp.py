@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import LinearModel, Plant, Reference, build_qp, linearise, load_tuning
+from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import LinearMPC, terminal_weight
-from pcr_mpc.control.tuning import Limits
 from tests.conftest import CONTROLLERS
 
 DT = 0.01

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from ...control.laws import Law
+from ...control.motor_limits import SAME_ANGLE, Limits
 from ...control.mpc import LinearMPC
 from ...control.observer import DisturbanceObserver
 from ...control.plan import Plan
 from ...control.qp import Reference
-from ...control.tuning import SAME_ANGLE, Limits
 from ...errors import PCRError, checked_period, measured_vector
 from ...frozen import made
 from ...linearisation.linear_limits import LinearLimits

@@ -8,11 +8,12 @@ from collections.abc import Callable
 import numpy as np
 
 from ...control.laws import LQR, PD, FeedForward, Law
+from ...control.motor_limits import Limits
 from ...control.mpc import LinearMPC
 from ...control.nonlinear_mpc import NonlinearMPC
 from ...control.observer import DisturbanceObserver
 from ...control.qp import motor_bounds, stage_weights
-from ...control.tuning import Limits, Model, Tuning
+from ...control.tuning import Model, Tuning
 from ...linearisation.linear_model import LinearModel
 from ...linearisation.linearise import linearise
 from ...plant.motion.plant import Plant

@@ -7,7 +7,7 @@ from operator import le, sub
 
 import numpy as np
 
-from ...control.tuning import Limits
+from ...control.motor_limits import Limits
 from ...errors import MeasurementError
 from ...plant.robot import Robot
 

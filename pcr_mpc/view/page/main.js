@@ -5,10 +5,11 @@
   const data = JSON.parse($("data").textContent);
   const live = data === null;
   document.body.classList.toggle("replay", !live);
-  let frame = null, drawn = null, about = null, role = { steers: live, free: false };
+  let frame = null, about = null, role = { steers: live, free: false };
   const send = (message) => link.send(message);
   const canvas = new Canvas($("robot")), panel = new Panel(send);
   let strips = [];
+  const queue = [];  // frames to be drawn, one by one: the screen's clock and the server's beat against each other
 
   function recolour(theme) {
     document.documentElement.dataset.theme = theme;
@@ -53,7 +54,11 @@
       if (data) $("scrub").max = data.frames.length - 1;
       drawLegend();
     },
-    frame(message) { frame = message; },
+    frame(message) {
+      frame = message;
+      queue.push(message);
+      if (queue.length > 2) queue.shift();
+    },
     role(message) { role = message; panel.setRole(role); },
     error(message) { panel.banner(message.message); },
     saved(message) { panel.banner(message.problem || `Recorded: ${message.folder}`, 8); },
@@ -91,12 +96,12 @@
   let planned = false;
   function turn(now) {
     requestAnimationFrame(turn);
-    if (!about || !frame) return;
-    if (frame === drawn) {
-      if (canvas.flashes.length) canvas.draw(frame, now / 1000);
+    if (!about) return;
+    const fresh = queue.shift();
+    if (!fresh) {
+      if (canvas.flashes.length) canvas.draw(canvas.last, now / 1000);
       return;
     }
-    const fresh = frame;
     for (const event of panel.takeEvents(fresh.events || [])) {
       if (event.p) canvas.flash(event, now / 1000);
       if (["refused", "failure", "recovered"].includes(event.kind)) panel.banner(event.message);
@@ -110,7 +115,6 @@
     for (const strip of strips) strip.draw(canvas.colour);
     if (data) $("scrub").value = fresh.n;
     if (Boolean(fresh.plan) !== planned) { planned = Boolean(fresh.plan); drawLegend(); }
-    drawn = fresh;
     window.pcr.frames += 1;
     link.drawn(fresh);
   }
