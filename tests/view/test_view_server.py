@@ -220,11 +220,11 @@ def test_a_recording_is_written(served, tmp_path):
 
 
 def test_a_page_that_does_not_draw_is_sent_no_more_and_misses_frames_not_time(served):
-    dropped = served.server.counts["dropped"]
+    counts = served.server.counts
+    dropped, made = counts["dropped"], counts["frames"]
     with served.socket() as socket:
         got = []
-        began = time.monotonic()
-        while time.monotonic() - began < 1.0:
+        while counts["frames"] < made + 20:  # however long a busy machine takes for them
             try:
                 message = json.loads(socket.recv(timeout=0.2))
             except TimeoutError:
@@ -234,8 +234,9 @@ def test_a_page_that_does_not_draw_is_sent_no_more_and_misses_frames_not_time(se
         assert len(got) <= 3
         ask(socket, do="seen", n=got[-1]["n"])
         later = until(socket, always)
-        assert later["t"] > got[-1]["t"] + 0.3  # the newest one, and none of those in between
-    assert served.server.counts["dropped"] > dropped
+        assert later["n"] > got[-1]["n"] + 10  # the newest one, and none of those in between
+        assert later["t"] > got[-1]["t"]
+    assert counts["dropped"] > dropped
 
 
 def test_news_is_not_dropped_with_frames():
