@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from ..codegen.folder import require_free_folder, write_folder
+from ..codegen.loss import measure_loss
 from ..codegen.scope import check_scope
 from ..codegen.subject import Subject
 from ..codegen.vectors import recorded
@@ -25,14 +27,19 @@ def generate(options: argparse.Namespace) -> int:
     tuning = check_scope(scene, tuning)
     folder = options.out or Path("build") / scene.name
     require_free_folder(folder, tuning.solver, force=options.overwrite)
-    subject = Subject.of_scene(scene, tuning)
-    run = recorded(subject, progress=True)
-    write_folder(subject, run, folder)
+    subject = Subject.of_scene(scene, tuning, single=options.float32)
+    run, loss = recorded(subject, progress=True), None
+    if options.float32:
+        print(f"{scene.name}: compiling and running it in single precision ...", file=sys.stderr)
+        loss = measure_loss(scene.name, lambda place: write_folder(subject, run, place), run.summary()["rms_mm"],
+                            subject.robot.lengths.max())  # fmt: skip
+    write_folder(subject, run, folder, loss)
     summary = {
         "scene": scene.name,
         "controller": subject.tuning.name,
         "solver": subject.tuning.solver,
         "rms_mm": run.summary()["rms_mm"],
+        "single": None if loss is None else asdict(loss),
         "folder": str(folder),
         "source_kB": round(sum(path.stat().st_size for path in folder.rglob("*.[ch]")) / 1e3),
     }
@@ -40,5 +47,7 @@ def generate(options: argparse.Namespace) -> int:
         print(json.dumps(summary))
     else:
         print(f"\nC of scene {scene.name}, controller {subject.tuning.name}, is in {folder}; to build and run it:\n")
+        if loss is not None:
+            print(f"  single precision: {loss}\n")
         print(f"  make -C {folder} && {folder / 'example'}\n\n{folder / 'README.md'} says how to use it")
     return 0

@@ -214,6 +214,8 @@ def parser() -> argparse.ArgumentParser:
     code.add_argument("--controller", type=Path, metavar="FILE|NAME", help="tuning instead of the scene's own: a "
                       "file, or a name of pcr-mpc models")  # fmt: skip
     code.add_argument("--solver", choices=("osqp", "daqp"), help="QP solver (default: the tuning's)")
+    code.add_argument("--float32", action="store_true", help="single precision, for processors without double: it is "
+                      "compiled and run here, what it costs is told, and refused where it is of no use")  # fmt: skip
     code.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default build/NAME)")
 
     unit = command(

@@ -10,6 +10,8 @@ from ..control.tuning import SOLVERS
 from ..errors import GenerationError
 from ..files import require_free, results, write_text
 from ..loop.run.run import Run
+from .loss import Loss
+from .precision import in_single
 from .readme import readme
 from .solver import licence, sources
 from .subject import Subject
@@ -39,7 +41,7 @@ def require_free_folder(folder: Path, solver: str, *, force: bool = False) -> No
         require_free(path, force=force)
 
 
-def write_folder(subject: Subject, run: Run | None, folder: Path) -> None:
+def write_folder(subject: Subject, run: Run | None, folder: Path, loss: Loss | None = None) -> None:
     """Write all of it.
 
     Parameters
@@ -48,26 +50,36 @@ def write_folder(subject: Subject, run: Run | None, folder: Path) -> None:
     run : Run or None
         The scene as Python runs it. None: what compiles to the library is enough.
     folder : Path
+    loss : Loss or None
+        What single precision costs, if that is known.
     """
     solver = subject.tuning.solver
     writers: list[Callable[[], str]] = [
-        lambda: config(subject),
+        lambda: config(subject, loss),
         lambda: tables(subject),
         lambda: subject.graphs.source,
         licence if solver == "osqp" else (_RUNTIME / "daqp" / "LICENSE").read_text,
     ]
     if run is not None:
-        writers += [lambda: vectors(subject, run), lambda: readme(subject, run)]
+        writers += [lambda: vectors(subject, run), lambda: readme(subject, run, loss)]
     texts = dict(zip(_files(folder, solver), writers, strict=False))
     copies = _copies(folder, solver)
     for place in dict.fromkeys(path.parent for path in (*texts, *copies)):
         with results(place) as staged:
             for path, write in texts.items():
                 if path.parent == place:
-                    write_text(staged / path.name, write())
+                    text = write()
+                    write_text(staged / path.name, in_single(text) if subject.single and _is_ours(path) else text)
             for path, source in copies.items():
-                if path.parent == place:
+                if path.parent == place and subject.single and _is_ours(path):
+                    write_text(staged / path.name, in_single(source.read_text(encoding="utf-8")))
+                elif path.parent == place:
                     shutil.copyfile(source, staged / path.name)
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is C of this package, which computes in one precision throughout; the solver has its own types."""
+    return path.suffix in (".c", ".h") and path.stem.startswith("pcr")
 
 
 def _files(folder: Path, solver: str) -> list[Path]:

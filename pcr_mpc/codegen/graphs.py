@@ -45,7 +45,14 @@ class Graphs:
 
 @building
 def make_graphs(
-    model: StepModel, target: StepModel, watched: StepModel, places: Places, law: LinearMPC, plant: Plant
+    model: StepModel,
+    target: StepModel,
+    watched: StepModel,
+    places: Places,
+    law: LinearMPC,
+    plant: Plant,
+    *,
+    rounding: float = 0.0,
 ) -> Graphs:
     """Put together the C of a controller's graphs and of a plant's.
 
@@ -57,13 +64,17 @@ def make_graphs(
         Of the controller.
     law : LinearMPC
     plant : Plant
+    rounding : float
+        See `foresight_graph`.
     """
     n, commanded = model.kind.n_rods, law.tuning.model.angles == "commanded"
     assert plant.step_model is not None
     condense = law.condensing(n, places.models, inline=False)
     steps = [step_graph(plant.step_model, count, details=False, inline=False) for count in (1, 2)]
     functions = {
-        "foresight": _called(foresight_graph(model, target, places, condense, commanded=commanded), "look_ahead"),
+        "foresight": _called(
+            foresight_graph(model, target, places, condense, commanded=commanded, rounding=rounding), "look_ahead"
+        ),
         "check": _called(checking(places.horizon, n, places.models, inline=False), "look_back"),
         "follow": _rods(model, 2, "follow"),
         "finish": _rods(model, 1, "finish"),

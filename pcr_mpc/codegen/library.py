@@ -55,9 +55,9 @@ def build(folder: Path, *words: str) -> Path:
     return folder / "libpcr.so"
 
 
-def _structures(n: int, horizon: int) -> tuple[Any, Any]:
+def _structures(n: int, horizon: int, real: Any) -> tuple[Any, Any]:
     """``pcr_measurement`` and ``pcr_output``."""
-    real, whole, states = ctypes.c_double, ctypes.c_int, 4 + n
+    whole, states = ctypes.c_int, 4 + n
 
     class Measurement(ctypes.Structure):
         _fields_ = (
@@ -90,12 +90,13 @@ class GeneratedController:
     def __init__(self, library: Path, subject: Subject) -> None:
         self.name = f"{subject.tuning.name} in C"
         self.n = subject.robot.n_rods
+        self._real: Any = ctypes.c_float if subject.single else ctypes.c_double
         self._code = ctypes.CDLL(str(Path(library).resolve()))
         self._code.pcr_controller_size.restype = ctypes.c_ulong
         self._memory = ctypes.create_string_buffer(self._code.pcr_controller_size() + 64)
         # Where its doubles are aligned.
         self._at = ctypes.c_void_p((ctypes.addressof(self._memory) + 63) // 64 * 64)
-        measurement, output = _structures(self.n, subject.tuning.horizon)
+        measurement, output = _structures(self.n, subject.tuning.horizon, self._real)
         self._measured, self.output = measurement(), output()
 
     def start(self, pose: Equilibrium | None = None) -> None:
@@ -106,7 +107,7 @@ class GeneratedController:
         PCRError
             The rods cannot follow there from where the scene starts.
         """
-        at = None if pose is None else (ctypes.c_double * (2 + self.n))(*pose.p, *pose.q)
+        at = None if pose is None else (self._real * (2 + self.n))(*pose.p, *pose.q)
         if code := self._code.pcr_controller_init(self._at, at):
             raise PCRError(f"the generated controller cannot start there: result {code} of pcr_controller_init")
 
@@ -119,7 +120,7 @@ class GeneratedController:
             They are refused.
         """
         flat = np.concatenate([np.ravel(value) for value in values.values()]).astype(float)
-        if code := self._code.pcr_controller_set_parameters(self._at, (ctypes.c_double * len(flat))(*flat)):
+        if code := self._code.pcr_controller_set_parameters(self._at, (self._real * len(flat))(*flat)):
             raise PCRError(f"the generated controller refuses these parameters: result {code}")
 
     def raw_step(self, x: np.ndarray) -> int:

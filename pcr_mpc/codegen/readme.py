@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from ..loop.run.run import Run
+from .loss import Loss
 from .solver import flops
 from .subject import Subject
 
@@ -19,7 +20,7 @@ _LICENCES = {
 _TEXT = Path(__file__).parent / "c" / "readme.md"
 
 
-def readme(subject: Subject, run: Run) -> str:
+def readme(subject: Subject, run: Run, loss: Loss | None = None) -> str:
     """Text of ``README.md``: the API, and the figures of this scene."""
     scene, tuning, summary = subject.scene, subject.tuning, run.summary()
     kind = subject.work.foresight.step_models[0].kind
@@ -44,6 +45,7 @@ def readme(subject: Subject, run: Run) -> str:
         "worst_flops": f"{worst * each:.2g}",
         "licence": _LICENCES[tuning.solver],
         "numbers": units,
+        "precision": "double" if not subject.single else f"single, which costs: {loss or 'not measured'}",
         "versions": f"casadi {version('casadi')}, {tuning.solver} {version(tuning.solver)}, "
         f"Python {platform.python_version()}",
     }

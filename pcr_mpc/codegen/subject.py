@@ -10,6 +10,7 @@ import numpy as np
 
 from ..control.mpc import LinearMPC, riccati
 from ..control.tuning import Tuning
+from ..errors import GenerationError
 from ..linearisation.pose_limits import PoseLimits
 from ..loop.controller.control_step import ControlStep
 from ..loop.controller.make_controller import make_controller
@@ -22,6 +23,7 @@ from ..plant.motion.step_graph import StepModel
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from .graphs import Graphs, make_graphs
+from .precision import ROUNDING
 from .scope import check_scope
 from .solver import Shape, limited_shapes, rates_shape
 
@@ -44,6 +46,8 @@ class Subject:
         Started there.
     plant : Plant
         At rest there.
+    single : bool
+        C is to compute in single precision.
     """
 
     scene: Scene
@@ -51,9 +55,10 @@ class Subject:
     pose: Equilibrium
     controller: TrackingController
     plant: Plant
+    single: bool = False
 
     @classmethod
-    def of_scene(cls, scene: Scene, tuning: Tuning | None = None) -> Subject:
+    def of_scene(cls, scene: Scene, tuning: Tuning | None = None, *, single: bool = False) -> Subject:
         """Start controller and plant of a scene.
 
         Raises
@@ -68,7 +73,32 @@ class Subject:
         controller.start(pose)
         plant = scene.plant.make(scene.robot)
         plant.reset(resting_state(pose), pose)
-        return cls(scene, tuning, pose, controller, plant)
+        subject = cls(scene, tuning, pose, controller, plant, single)
+        if single:
+            subject.check_single()
+        return subject
+
+    def check_single(self) -> None:
+        """Raise if C of this cannot be in single precision.
+
+        Raises
+        ------
+        GenerationError
+            Says what cannot.
+        """
+        models = (*self.work.foresight.step_models, self.watched, self.plant.step_model)
+        if any(model is not None and model.method.name != "closed_form" for model in models):
+            raise GenerationError(f"{self.scene.name}: single precision knows rods in closed form only, as the "
+                                  "equations of rods that are shot have a condition of 1e8; leave --float32 out",
+                                  part="float32")  # fmt: skip
+        if self.tuning.solver != "osqp":
+            raise GenerationError(f"{self.scene.name}: single precision is for OSQP only, as DAQP decides by "
+                                  "tolerances of double; take --solver osqp", part="float32")  # fmt: skip
+
+    @property
+    def rounding(self) -> float:
+        """Residual below which rods cannot come."""
+        return ROUNDING if self.single else 0.0
 
     @property
     def robot(self) -> Robot:
@@ -100,7 +130,9 @@ class Subject:
     def graphs(self) -> Graphs:
         """C of all graphs."""
         model, target = self.work.foresight.step_models
-        return make_graphs(model, target, self.watched, self.work.foresight.places, self.law, self.plant)
+        return make_graphs(
+            model, target, self.watched, self.work.foresight.places, self.law, self.plant, rounding=self.rounding
+        )
 
     @property
     def watched(self) -> StepModel:

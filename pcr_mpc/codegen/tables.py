@@ -22,6 +22,8 @@ from ..plant.motion.step_graph import limits as step_limits
 from ..plant.rods.chart import critical_load_table
 from ..plant.rods.numbers import Kind
 from .ctext import array, block, defines, number, structure
+from .loss import Loss
+from .precision import tolerances
 from .solver import Shape, daqp_room
 from .subject import KIND_BITS, Subject
 
@@ -43,7 +45,7 @@ def _outputs(function: Any) -> tuple[list[str], list[int]]:
     return list(function.name_out()), [function.numel_out(i) for i in range(function.n_out())]
 
 
-def config(subject: Subject) -> str:
+def config(subject: Subject, loss: Loss | None = None) -> str:
     """Text of ``pcr_config.h``."""
     scene, tuning, work, graphs = subject.scene, subject.tuning, subject.work, subject.graphs
     n, horizon, places = subject.robot.n_rods, tuning.horizon, work.foresight.places
@@ -75,9 +77,9 @@ def config(subject: Subject) -> str:
         "PCR_TARGET_WIDTH": _width(target),
         "PCR_WATCH_WIDTH": _width(watched),
         "PCR_LARGEST_RECORD": max(sizes(one).record for one in (model, target, watched)),
-        "PCR_FOLLOWING": model.method.following,
-        "PCR_TARGET_FOLLOWING": target.method.following,
-        "PCR_WATCH_FOLLOWING": watched.method.following,
+        "PCR_FOLLOWING": max(model.method.following, subject.rounding),
+        "PCR_TARGET_FOLLOWING": max(target.method.following, subject.rounding),
+        "PCR_WATCH_FOLLOWING": max(watched.method.following, subject.rounding),
         "PCR_WATCH_FOLLOWS": int(work.watch.follows_model),
         "PCR_WATCH_SHOT": int(watched.kind.layout is not None),
         "PCR_WATCH_RECORD": sizes(watched).record,
@@ -130,8 +132,8 @@ def config(subject: Subject) -> str:
         "PCR_PLANT_TIP_MASS": of_plant.kind.names.index("tip_mass"),
         "PCR_PLANT_ROD_NUMBERS": of_plant.kind.names.index("rods[1].bending_stiffness"),
         "PCR_PLANT_START": of_plant.widths[0],
-    }
-    values |= _hardware(subject)
+    }  # fmt: skip
+    values |= _hardware(subject) | tolerances(single=subject.single) | _losses(subject, loss)
     values["PCR_PHYSICS"] = watched.kind.layout.size if watched.kind.layout is not None else 0
     if watched.kind.layout is not None:
         strain = strain_graphs(watched.kind, _width(watched) // 4)
@@ -179,6 +181,18 @@ def _hardware(subject: Subject) -> dict[str, Any]:
         "PCR_WAITING": untold.steps + (untold.fraction > 0.0),
         "PCR_WITHIN": untold.fraction,
     }
+
+
+def _losses(subject: Subject, loss: Loss | None) -> dict[str, Any]:
+    """By how much the example may differ from Python [mm], [rad/s], [periods], and its plant alone in any state."""
+    names = ("PCR_RMS_LOSS", "PCR_RATES_LOSS", "PCR_OTHER_PERIODS", "PCR_APART")
+    if not subject.single:
+        return dict(zip(names, (1e-9, 1e-9, 0, 1e-12), strict=True))
+    if loss is None:
+        return dict(zip(names, (math.inf, math.inf, subject.scene.n_periods, math.inf), strict=True))
+    # Another compiler rounds otherwise.
+    worst = 2 * abs(loss.rms_mm - loss.double_rms_mm), 2 * loss.same, 2 * loss.others + 1, math.inf
+    return dict(zip(names, worst, strict=True))
 
 
 def _width(model: StepModel) -> int:
@@ -250,7 +264,7 @@ def tables(subject: Subject) -> str:
         array("double", "pcr_scene_mass", given["mass"].ravel(order="F")),
         array("double", "pcr_scene_memory", plant.memory(x)),
         array("double", "pcr_scene_plant_numbers", plant.numbers),
-        array("double", "pcr_plant_limits", np.array(step_limits(plant.step_model))),
+        array("double", "pcr_plant_limits", np.fmax(step_limits(plant.step_model), [subject.rounding, 0, 0, 0, 0])),
         array("int", "pcr_in_places", np.array([0, *np.cumsum(_inputs(foresight)[1])[:-1]])),
         array("int", "pcr_out_places", np.array([0, *np.cumsum(_outputs(foresight)[1])[:-1]])),
         array("double", "pcr_scene_reference", _without_rates(subject, reference)),

@@ -59,7 +59,7 @@ static void show(const char *name, took *times, int count)
 }
 
 /* Tip of the plant at all its steps so far, of which pictures are taken. */
-static double tips[PCR_PERIODS * PCR_STEPS_A_PERIOD + 1][2];
+static pcr_real tips[PCR_PERIODS * PCR_STEPS_A_PERIOD + 1][2];
 
 static void look(int step)
 {
@@ -67,7 +67,7 @@ static void look(int step)
 }
 
 /* Tip of the picture that has come after so many steps. */
-static void picture(int step, double *p)
+static void picture(int step, pcr_real *p)
 {
     const double at = fmax(step - PCR_PICTURE_AGE, 0.0);
     const int before = (int)at, after = before + 1 < step ? before + 1 : step;
@@ -97,7 +97,7 @@ static void measure(int k, pcr_measurement *measured)
 
 /* Rates that reach the motors in this step, which come later than any controller was told; mean rates where they come
    within a step. */
-static void later(double (*waiting)[PCR_N], const double *told, double *u)
+static void later(pcr_real (*waiting)[PCR_N], const pcr_real *told, pcr_real *u)
 {
     memcpy(waiting[PCR_WAITING], told, PCR_N * sizeof *told);
     for (int i = 0; i < PCR_N; i++) {
@@ -110,7 +110,7 @@ static void later(double (*waiting)[PCR_N], const double *told, double *u)
 /* One run of the scene, with the rates that C decides or, `recorded`, with those of Python; times of control steps and plant steps are added to those that are there. */
 static int run(int recorded, took *control, took *steps, double *square, double *away, int *others, double *apart)
 {
-    double on_the_way[PCR_REAL_DELAY + 1][PCR_N] = {{0.0}}, waiting[PCR_WAITING + 1][PCR_N] = {{0.0}}, u[PCR_N];
+    pcr_real on_the_way[PCR_REAL_DELAY + 1][PCR_N] = {{0.0}}, waiting[PCR_WAITING + 1][PCR_N] = {{0.0}}, u[PCR_N];
     pcr_measurement measured;
     pcr_output output;
     if (pcr_controller_init(&controller, NULL) != PCR_OK || pcr_plant_init(&plant, NULL) != PCR_OK) {
@@ -251,5 +251,6 @@ int main(int count, char **words)
     printf("\ncontroller %lu bytes, plant %lu bytes\n", pcr_controller_size(), pcr_plant_size());
     free(control);
     free(steps);
-    return fabs(rms - pcr_vector_rms_mm) <= 1e-9 && replayed <= 1e-9 && other_rungs == 0 && apart <= 1e-12 ? 0 : 2;
+    const int as_recorded = fabs(rms - pcr_vector_rms_mm) <= PCR_RMS_LOSS && replayed <= PCR_RATES_LOSS;
+    return as_recorded && other_rungs <= PCR_OTHER_PERIODS && apart <= PCR_APART ? 0 : 2;
 }

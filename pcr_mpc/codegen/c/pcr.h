@@ -14,6 +14,9 @@
 extern "C" {
 #endif
 
+/* Of all numbers of the structures. */
+typedef double pcr_real;
+
 /* What a function found; 0 is good. */
 typedef enum {
     PCR_OK = 0,

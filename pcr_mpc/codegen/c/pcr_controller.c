@@ -6,7 +6,6 @@
 #include "pcr_graphs.h"
 #include "pcr_parts.h"
 
-#define SAME_ANGLE 1e-9
 #define NEAR 0.5  /* of `good`: another iteration will do */
 #define AGAIN 3   /* evaluations at most for rods that are near */
 
@@ -65,7 +64,7 @@ static int bring_along(pcr_controller *c)
         if (good[j] < 1.0) {
             double x[PCR_STATES], *record = c->in + PCR_IN_RECORDS + j * PCR_RECORD;
             memcpy(x, c->out + PCR_OUT_PLACES + j * PCR_STATES, sizeof x);
-            if (pcr_follow(&pcr_model_rods, c->parameters.numbers, x, x + 4, 1e-6, record, result, room_of(c))) {
+            if (pcr_follow(&pcr_model_rods, c->parameters.numbers, x, x + 4, PCR_CLOSE, record, result, room_of(c))) {
                 return 1;
             }
             foresee(c);
@@ -167,9 +166,9 @@ pcr_result pcr_controller_init(pcr_controller *c, const pcr_pose *pose)
     memcpy(c->watch_at, at->p, sizeof at->p);
     memcpy(c->watch_at + 2, at->q, sizeof at->q);
     if (pose != NULL) {
-        if (pcr_follow(&pcr_model_rods, c->parameters.numbers, at->p, at->q, 1e-6, record, result, room_of(c))
-            || pcr_follow(&pcr_target_rods, c->in + PCR_IN_TARGET_NUMBERS, at->p, at->q, 1e-6, target, result, room_of(c))
-            || pcr_follow(&pcr_watch_rods, c->watch_numbers, at->p, at->q, 1e-6, c->watch_record,
+        if (pcr_follow(&pcr_model_rods, c->parameters.numbers, at->p, at->q, PCR_CLOSE, record, result, room_of(c))
+            || pcr_follow(&pcr_target_rods, c->in + PCR_IN_TARGET_NUMBERS, at->p, at->q, PCR_CLOSE, target, result, room_of(c))
+            || pcr_follow(&pcr_watch_rods, c->watch_numbers, at->p, at->q, PCR_CLOSE, c->watch_record,
                           c->watch_result, room_of(c))) {
             return PCR_OUT_OF_REACH;
         }
@@ -334,7 +333,7 @@ pcr_result pcr_controller_step(pcr_controller *c, const pcr_measurement *measure
     double u[PCR_N];
     memcpy(u, c->inputs[0], sizeof u);
     int as_planned = 1;
-    if (failed || !(strayed <= SAME_ANGLE)) {
+    if (failed || !(strayed <= PCR_SAME_ANGLE)) {
         pcr_kept(c, c->inputs[0], c->u, ahead + 4, out + PCR_OUT_RECKONED, u);
         for (int i = 0; i < PCR_N; i++) {
             as_planned = as_planned && u[i] == c->inputs[0][i];

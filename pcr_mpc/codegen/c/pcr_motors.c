@@ -4,8 +4,6 @@
 
 #include "pcr_parts.h"
 
-#define SAME_ANGLE 1e-9
-#define MET 1e-12
 
 static double least(double a, double b)
 {
@@ -43,7 +41,7 @@ void pcr_kept(const pcr_controller *controller, const double *u, const double *p
         const double at = q[i], also = reckoned == NULL ? at : reckoned[i], before = previous[i];
         if (isfinite(at)) {
             double low = at, high = at;
-            if (fabs(also - at) > SAME_ANGLE) {
+            if (fabs(also - at) > PCR_SAME_ANGLE) {
                 low = least(at, also);
                 high = most(at, also);
             }
@@ -81,7 +79,7 @@ int pcr_met(const pcr_controller *controller, const double *u, const double *pre
     int met = 0;
     for (int i = 0; i < PCR_N; i++) {
         met |= fabs(u[i]) >= limits->rate ? PCR_LIMIT_RATE : 0;
-        met |= fabs(u[i] - previous[i]) >= limits->rate_change * (1.0 - MET) ? PCR_LIMIT_RATE_CHANGE : 0;
+        met |= fabs(u[i] - previous[i]) >= limits->rate_change * (1.0 - PCR_MET) ? PCR_LIMIT_RATE_CHANGE : 0;
     }
     return met ? met : PCR_LIMIT_ANGLE;
 }

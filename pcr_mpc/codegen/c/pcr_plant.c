@@ -6,8 +6,6 @@
 #include "pcr_graphs.h"
 #include "pcr_parts.h"
 
-#define ROUGH 1e-4
-
 /* Let the rods of such numbers follow from `record` to where the plant is. Returns 0 if they did. */
 static int bring(pcr_plant *plant, const double *numbers, double *record)
 {
@@ -17,7 +15,7 @@ static int bring(pcr_plant *plant, const double *numbers, double *record)
     room.res = plant->res;
     room.iw = plant->iw;
     room.w = plant->w;
-    if (pcr_follow(&pcr_model_rods, numbers, plant->x, plant->x + 4, 1e-6, record, result, room)) {
+    if (pcr_follow(&pcr_model_rods, numbers, plant->x, plant->x + 4, PCR_CLOSE, record, result, room)) {
         return 1;
     }
     memcpy(plant->memory, record, PCR_PLANT_START * sizeof *record);
@@ -136,7 +134,7 @@ pcr_result pcr_plant_step(pcr_plant *plant, const double *u, const double *force
             plant->corrections = corrections;
             return PCR_OK;
         }
-        if (!(verdict[0] <= ROUGH)) {
+        if (!(verdict[0] <= PCR_ROUGH)) {
             break; /* lost, not just unfinished */
         }
     }

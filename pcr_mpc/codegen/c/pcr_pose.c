@@ -143,7 +143,7 @@ static double determinant(const pcr_watch *w, double log_tip_angle, double load)
 /* Zero between low and high, where the determinant has two signs, by bisection and secants. */
 static double zero(const pcr_watch *w, double log_tip_angle, double low, double high, double at_low, double at_high)
 {
-    for (int i = 0; i < 200 && high - low > 1e-11; i++) {
+    for (int i = 0; i < 200 && high - low > PCR_NARROW; i++) {
         double middle = (low * at_high - high * at_low) / (at_high - at_low);
         if (i % 2 || !(middle > low && middle < high)) {
             middle = 0.5 * (low + high);
@@ -184,7 +184,7 @@ static double critical_load(const pcr_watch *w, double log_tip_angle)
 
 static double critical_load_slope(const pcr_watch *w, double log_tip_angle, double critical)
 {
-    const double h = 1e-4;
+    const double h = PCR_DIFFERENCE;
     const double by_angle = determinant(w, log_tip_angle + h, critical) - determinant(w, log_tip_angle - h, critical);
     return -by_angle
            / (determinant(w, log_tip_angle, critical + h) - determinant(w, log_tip_angle, critical - h));
@@ -276,7 +276,7 @@ int pcr_near(pcr_controller *controller, pcr_pose_limits *limits)
                       || memcmp(controller->watch_at + 2, ahead + 4, PCR_N * sizeof *ahead) != 0;
     if (moved) {
         controller->watch_at[0] = NAN;
-        if (pcr_follow(&pcr_watch_rods, controller->watch_numbers, ahead, ahead + 4, 1e-6, w.record,
+        if (pcr_follow(&pcr_watch_rods, controller->watch_numbers, ahead, ahead + 4, PCR_CLOSE, w.record,
                        controller->watch_result, w.room)) {
             return 1;
         }

@@ -5,7 +5,6 @@
 #include "pcr_graphs.h"
 #include "pcr_parts.h"
 
-#define ROUGH 1e-4
 #define BRANCH_CHANGE 0.3
 #define LARGEST_DRIFT 1e-3
 #define MOST_ITERATIONS 8
@@ -28,7 +27,7 @@ static int climb(const pcr_rods *rods, const double *numbers, const double *p, c
     double changed = 0.0;
     const size_t size = PCR_RECORD_OF((size_t)rods->width) * sizeof *record;
     /* Where rough derivatives will do, one iteration usually does. */
-    const int first = derivatives >= ROUGH ? 1 : 2, most = hasty ? first + 1 : MOST_ITERATIONS;
+    const int first = derivatives >= PCR_ROUGH ? 1 : 2, most = hasty ? first + 1 : MOST_ITERATIONS;
     memcpy(target, p, 2 * sizeof *target);
     memcpy(target + 2, q, PCR_N * sizeof *target);
     memcpy(start, record, size);
@@ -42,7 +41,7 @@ static int climb(const pcr_rods *rods, const double *numbers, const double *p, c
         (done || first == 1 ? rods->once : rods->twice)(room.arg, room.res, room.iw, room.w);
         changed += verdict[2];
         /* Written so that NaN is a failure. */
-        if (!(changed <= BRANCH_CHANGE && verdict[3] == 0.0) || (hasty && !(verdict[0] <= ROUGH))) {
+        if (!(changed <= BRANCH_CHANGE && verdict[3] == 0.0) || (hasty && !(verdict[0] <= PCR_ROUGH))) {
             return 1;
         }
         if (verdict[0] <= rods->following && verdict[1] <= derivatives) {
@@ -96,7 +95,7 @@ int pcr_follow(const pcr_rods *rods, const double *numbers, const double *p, con
             const double to = i < 2 ? p[i] : q[i - 2];
             at[i] = next < 1.0 ? from[i] + next * (to - from[i]) : to;
         }
-        if (climb(rods, numbers, at, at + 2, 1e-6, 0, moving, result, room)) {
+        if (climb(rods, numbers, at, at + 2, PCR_CLOSE, 0, moving, result, room)) {
             substep /= 2.0;
             if (substep < smallest) {
                 return 1;

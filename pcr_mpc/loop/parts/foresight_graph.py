@@ -26,7 +26,6 @@ from ...plant.rods.follower import BRANCH_CHANGE
 # What a verdict of `model_graph` may be: the pose is solved far better than a controller can tell, K and G to 1e-4.
 _SOLVED, _DERIVATIVES = 1e-8, 1e-4
 _LARGEST_STEP = 0.1  # of the motor target in a period [rad]
-_VERDICT = [_SOLVED, _DERIVATIVES, BRANCH_CHANGE, 0.0, LARGEST_DRIFT]
 _NEAR = 1e-2  # residual from which Newton's method is as good as sure to get there, on the branch that it is on
 _LATEST = 10.0  # periods that motors may be late
 _SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
@@ -65,6 +64,7 @@ def foresight_graph(
     *,
     commanded: bool = True,
     inline: bool = False,
+    rounding: float = 0.0,
 ) -> Any:
     """Build the graph.
 
@@ -80,6 +80,8 @@ def foresight_graph(
         what comes to nothing then.
     inline : bool
         Make one list of instructions of each model, for CasADi's interpreter; else calls, for a compiler.
+    rounding : float
+        Residual below which the numbers that it will be computed in cannot come.
 
     Returns
     -------
@@ -126,18 +128,18 @@ def foresight_graph(
     corrected = _corrected(given, n, commanded=commanded)
     x, force = corrected[:-2], corrected[-2:]
     graph_of = model_list if inline else model_graph
-    found = [_place(graph_of, model, given, x, force, 0, last=count == 1)]
+    found = [_place(graph_of, model, given, x, force, 0, rounding, last=count == 1)]
     ahead = arriving = x
     for j in range(places.delay):
         ahead = _moved(found[j][1], ahead, given.on_the_way[:, j], n)
         arriving = ahead if j == 0 else arriving
-        found.append(_place(graph_of, model, given, ahead, force, j + 1, last=j + 1 == count - 1))
+        found.append(_place(graph_of, model, given, ahead, force, j + 1, rounding, last=j + 1 == count - 1))
     due, rates = _due(given, places.horizon) if commanded else (ca.DM(n, places.horizon + 1), ca.DM(n, 1))
     for j in range(places.delay + 1, count):
         there = given.path[:, j - places.delay - 1] - ca.vertcat(ca.DM(4, 1), due[:, j - places.delay])
-        found.append(_place(graph_of, model, given, there, force, j, last=j == count - 1))
+        found.append(_place(graph_of, model, given, there, force, j, rounding, last=j == count - 1))
     records, models, good, states_of = (ca.horzcat(*columns) for columns in zip(*found, strict=True))
-    shift, target_record, target_good = _shifted(target, given, force, n)
+    shift, target_record, target_good = _shifted(target, given, force, n, rounding)
     states = given.states + ca.vertcat(
         ca.DM.zeros(4, places.horizon), ca.repmat(shift, 1, places.horizon) + due[:, 1:]
     )  # fmt: skip
@@ -224,6 +226,7 @@ def _place(
     x: Any,
     force: Any,
     j: int,
+    rounding: float,
     *,
     last: bool,
 ) -> tuple[Any, ...]:
@@ -231,7 +234,11 @@ def _place(
     memory = given.records[: sizes(model).memory, j]
     graph = graph_of(model, 2 if last else 1)
     record, packed, verdict = graph(x, force, given.payloads[j], memory, given.numbers, given.mass, given.dt)
-    return record, packed, _grade(verdict, [*_VERDICT, STIFFEST, STIFFEST]), x
+    return record, packed, _grade(verdict, [*_verdict(rounding), STIFFEST, STIFFEST]), x
+
+
+def _verdict(rounding: float) -> list[float]:
+    return [max(_SOLVED, rounding), max(_DERIVATIVES, rounding), BRANCH_CHANGE, 0.0, LARGEST_DRIFT]
 
 
 def _grade(verdict: Any, limits: list[float]) -> Any:
@@ -248,7 +255,7 @@ def _moved(packed: Any, x: Any, u: Any, n: int) -> Any:
     return ca.reshape(a, n_states, n_states) @ x + ca.reshape(b, n_states, n) @ u + c
 
 
-def _shifted(target: StepModel, given: Any, force: Any, n: int) -> tuple[Any, Any, Any]:
+def _shifted(target: StepModel, given: Any, force: Any, n: int, rounding: float) -> tuple[Any, Any, Any]:
     """Angles to add to those of the reference so that the rods carry the observed force too, at the end of the window.
 
     One Newton iteration a period: where tip and force do not change it converges, which is what makes the controller
@@ -258,7 +265,7 @@ def _shifted(target: StepModel, given: Any, force: Any, n: int) -> tuple[Any, An
     pose = ca.vertcat(end[:2], end[4:] + given.shift)
     memory = given.target[: sizes(target).memory]
     record, verdict, found, _, g = force_graph(target, 1)(pose, memory, given.target_numbers)
-    grade = _grade(verdict, [_DERIVATIVES, *_VERDICT[1:]])
+    grade = _grade(verdict, [max(_DERIVATIVES, rounding), *_verdict(rounding)[1:]])
     numbers = target.kind.unpack(given.target_numbers)
     square = g @ g.T
     a, b, d = square[0, 0], square[0, 1], square[1, 1]

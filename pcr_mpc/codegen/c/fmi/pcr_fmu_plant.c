@@ -9,6 +9,7 @@ static void show(fmu *instance)
 {
     fmu_state *state = &instance->state;
     memcpy(state->reals + FMU_X, state->part.x, sizeof state->part.x);
+    pcr_plant_angles(&state->part, state->reals + FMU_X + 4);
     state->wholes[FMU_CORRECTIONS] = state->part.corrections;
 }
 

@@ -2,7 +2,12 @@
 #ifndef OSQP_CONFIGURE_H
 #define OSQP_CONFIGURE_H
 
+#include "pcr_config.h"
+
 #define OSQP_ALGEBRA_BUILTIN
 #define OSQP_EMBEDDED_MODE 2
+#if PCR_SINGLE
+#define OSQP_USE_FLOAT
+#endif
 
 #endif
