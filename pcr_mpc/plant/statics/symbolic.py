@@ -39,13 +39,52 @@ def symbolic_dynamics(robot: Robot, hands: tuple[float, ...]) -> Any:
         residual (2n) = (tip of the rod - p) / L, beyond (n): 1 where a rod is past its limit of stability with
         the tip held, else 0).
     """
-    require_plain(robot, "symbolic_dynamics")
+    n = robot.n_rods
+    p, v, f_ext = ca.SX.sym("p", 2), ca.SX.sym("v", 2), ca.SX.sym("f_ext", 2)
+    q, z = ca.SX.sym("q", n), ca.SX.sym("z", 2 * n)
+    force, residual, _, beyond = _rods(robot, hands, p, q, z, "symbolic_dynamics")
+    acceleration = (f_ext - force - robot.drag * v) / robot.tip_mass
+    return ca.Function(
+        "dynamics",
+        [p, v, q, z, f_ext],
+        [acceleration, residual, beyond],
+        ["p", "v", "q", "z", "f_ext"],
+        ["acceleration", "residual", "beyond"],
+        {"cse": True},
+    )
+
+
+@graph_cache(maxsize=16)
+def symbolic_statics(robot: Robot, hands: tuple[float, ...], stiffness: bool = False) -> Any:
+    """What the rods carry, with their unknowns as in `symbolic_dynamics`.
+
+    Returns
+    -------
+    casadi.Function
+        (p (2) [m], q (n) [rad], z (2n)) -> (F (2) [N], residual (2n), motor torques (n) [N m]), and if ``stiffness``
+        then K (2, 2) [N/m], by implicit differentiation.
+    """
+    n = robot.n_rods
+    p, q, z = ca.SX.sym("p", 2), ca.SX.sym("q", n), ca.SX.sym("z", 2 * n)
+    force, residual, torque, _ = _rods(robot, hands, p, q, z, "symbolic_statics")
+    found = [force, residual, torque]
+    if stiffness:
+        k = ca.SX(2, 2)
+        for i, rod in enumerate(robot.rods):
+            own = slice(2 * i, 2 * i + 2)
+            # The rod's tip follows p: d residual/dz dz/dp = 1/L.
+            k += ca.jacobian(force, z[own]) @ ca.solve(ca.jacobian(residual[own], z[own]), ca.SX.eye(2)) / rod.length
+        found.append(k)
+    return ca.Function("statics", [p, q, z], found, {"cse": True})
+
+
+def _rods(robot: Robot, hands: tuple[float, ...], p: Any, q: Any, z: Any, what: str) -> tuple[Any, Any, Any, Any]:
+    """Expressions of force, residual, motor torques, and whether rods are past their limit."""
+    require_plain(robot, what)
     n = robot.n_rods
     if len(hands) != n or any(abs(hand) != 1.0 for hand in hands):
         raise ValueError(f"hands is {hands}, expected +1 or -1 for each of {n} rods")
-    p, v, f_ext = ca.SX.sym("p", 2), ca.SX.sym("v", 2), ca.SX.sym("f_ext", 2)
-    q, z = ca.SX.sym("q", n), ca.SX.sym("z", 2 * n)
-    force, residuals, beyond = ca.SX(2, 1), [], []
+    force, residuals, torques, beyond = ca.SX(2, 1), [], [], []
     for i, (rod, hand) in enumerate(zip(robot.rods, hands, strict=True)):
         unknowns = z[2 * i : 2 * i + 2]
         load = unknowns[1]
@@ -57,16 +96,9 @@ def symbolic_dynamics(robot: Robot, hands: tuple[float, ...]) -> Any:
         residual = ca.DM(rod.base) / rod.length + tip - p / rod.length
         residuals.append(residual)
         force += rod.bending_stiffness / rod.length**2 * load**2 * along
+        torques.append(-rod.bending_stiffness / rod.length * hand * load * rate)
         beyond.append(beyond_limit(hand * ca.det(ca.jacobian(residual, unknowns)), unknowns))
-    acceleration = (f_ext - force - robot.drag * v) / robot.tip_mass
-    return ca.Function(
-        "dynamics",
-        [p, v, q, z, f_ext],
-        [acceleration, ca.vertcat(*residuals), ca.vertcat(*beyond)],
-        ["p", "v", "q", "z", "f_ext"],
-        ["acceleration", "residual", "beyond"],
-        {"cse": True},
-    )
+    return force, ca.vertcat(*residuals), ca.vertcat(*torques), ca.vertcat(*beyond)
 
 
 def rod_unknowns(robot: Robot, pose: Equilibrium) -> tuple[tuple[float, ...], Callable[..., np.ndarray]]:

@@ -139,9 +139,9 @@ def balanced(
 
 def stood(moved: Motion, pose: Equilibrium, q: np.ndarray, near: Equilibria | None, tolerance: float) -> Stand:
     """Solve the rods for the forces of a motion; see `balanced`."""
-    poses, q = balanced(pose, moved.path[0].value, moved.force[0].value, q, near, tolerance)
+    poses, q = balanced(pose, moved.path[0], moved.force[0].value, q, near, tolerance)
     levers = _levers(poses.dforce_dq)
-    p1 = moved.path[1].value
+    p1 = moved.path[1]
     q1 = np.einsum("mij,mj->mi", levers, moved.force[1].value - np.einsum("mij,mj->mi", poses.dforce_dp, p1))
     return Stand(pose, poses, q, levers, _along(pose, poses, p1, q1, levers))
 
@@ -149,26 +149,22 @@ def stood(moved: Motion, pose: Equilibrium, q: np.ndarray, near: Equilibria | No
 def angles(moved: Motion, stand: Stand, x: np.ndarray) -> Angles:
     """Motor angles, rates and accelerations of a motion at the points x."""
     f, f1, f2 = moved.force
-    p, p1, p2 = moved.path
+    _, p1, p2 = moved.path
     poses, levers, (k1, h1) = stand.poses, stand.levers, stand.along
     stiffness = poses.dforce_dp
-    # Along x: K P' + G q' = F', with H = G^+. The slopes: K dP + G dq = dF at every x.
-    first = f1 - p1.through(stiffness)
-    push = f - p.through(stiffness)
-    push1 = f1 - p.through(k1) - p1.through(stiffness)
-    second = f2 - p1.through(k1) - p2.through(stiffness)
-    q_lin = Linear(stand.q, push.through(levers).slope)
-    turn = Linear(first.through(levers).value, push1.through(levers).slope + push.through(h1).slope)
-    turn2 = second.through(levers) + first.through(h1)
-    if p.slope.size:
-        k2, h2 = _derivative(x, k1), _derivative(x, h1)
-        push2 = f2 - p.through(k2) - 2.0 * p1.through(k1) - p2.through(stiffness)
-        slope = push2.through(levers).slope + 2.0 * push1.through(h1).slope + push.through(h2).slope
+    # Along x: K P' + G q' = F', with H = G^+. The slopes: G dq = dF at every x.
+    first = f1.less(stiffness, p1)
+    turn = Linear(first.through(levers).value, f1.through(levers).slope + f.through(h1).slope)
+    turn2 = f2.less(k1, p1).less(stiffness, p2).through(levers) + first.through(h1)
+    if f.slope.size:
+        h2 = _derivative(x, h1)
+        slope = f2.through(levers).slope + 2.0 * f1.through(h1).slope + f.through(h2).slope
         turn2 = Linear(turn2.value, slope)
+    q = Linear(stand.q, f.through(levers).slope)
     rate = turn * moved.theta
     acceleration = turn2 * moved.pace + 0.5 * (turn * moved.pace_slope)
-    dtau = poses.dtorque_dq[:, :, None] * q_lin.slope + np.einsum("mji,mjd->mid", poses.dforce_dq, p.slope)
-    return Angles(q_lin, rate, acceleration, Linear(poses.motor_torque, dtau), stand)
+    torque = Linear(poses.motor_torque, poses.dtorque_dq[:, :, None] * q.slope)
+    return Angles(q, rate, acceleration, torque, stand)
 
 
 def _levers(coupling: np.ndarray) -> np.ndarray:

@@ -2,39 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
-
 import numpy as np
 from scipy.interpolate import BSpline
 
 from .path import TipPath, fitted
-
-
-class Course(Protocol):
-    """Where the tip is at x.
-
-    Attributes
-    ----------
-    unknowns : int
-        Of the course itself; none if its path is given.
-    """
-
-    @property
-    def unknowns(self) -> int:
-        """See above."""
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """P and its first four derivatives, shape (5, len(x), 2)."""
-
-    def basis(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which unknowns count at the points x, (len(x), j), and how x of P and its derivatives, then y, change with
-        them, (10, len(x), j)."""
-
-    def held(self) -> Any | None:
-        """Rows of the unknowns whose sums are to stay zero: sparse, (rows, unknowns); None if there are none."""
-
-    def moved(self, change: np.ndarray) -> Course:
-        """Return the course with its unknowns changed."""
 
 
 class PacedPath:
@@ -51,7 +22,7 @@ class PacedPath:
         self.path, self.nominal = path, nominal
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """See `Course`: the chain rule (Faa di Bruno)."""
+        """P and its first four derivatives, shape (5, len(x), 2): the chain rule (Faa di Bruno)."""
         s, s1, s2, s3, s4 = (self.nominal(x, nu=order)[:, None] for order in range(5))
         p, p1, p2, p3, p4 = self.path.derivatives(s[:, 0])
         return np.stack(
@@ -63,23 +34,6 @@ class PacedPath:
                 p4 * s1**4 + 6.0 * p3 * s1**2 * s2 + p2 * (3.0 * s2**2 + 4.0 * s1 * s3) + p1 * s4,
             ]
         )
-
-    @property
-    def unknowns(self) -> int:
-        """See `Course`."""
-        return 0
-
-    def basis(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Course`."""
-        return np.empty((len(x), 0), dtype=int), np.empty((10, len(x), 0))
-
-    def held(self) -> Any | None:
-        """See `Course`."""
-        return None
-
-    def moved(self, change: np.ndarray) -> PacedPath:
-        """See `Course`."""
-        return self
 
     def repaced(self, x: np.ndarray, share: np.ndarray, cells: int) -> PacedPath:
         """Return the same path at another pace.

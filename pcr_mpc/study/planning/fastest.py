@@ -8,7 +8,6 @@ steps can then be ten times as long. The limits' shares are kept by an exact pen
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -102,22 +101,16 @@ class _Program:
 
     def __init__(self, timing: Timing, allowed: float) -> None:
         self._timing, self._allowed = timing, allowed
-        pace, course = timing.pace, timing.problem.course
+        pace = timing.pace
         x, weights = quadrature(pace)
-        paces = len(pace.c)
-        # Unknowns: relative changes of the coefficients of b, and what the course has of its own.
+        # Unknowns: relative changes of the coefficients of b.
         gradient = -0.5 * (weights * pace(x) ** -1.5) @ unit_splines(pace)(x) / timing.duration * pace.c
-        self._gradient = np.concatenate([gradient, np.zeros(course.unknowns)])
-        self._paces = paces
-        # Few of them count at each point: which, and how b, P and their derivatives change with them.
+        self._gradient = gradient
+        # Few of them count at each point: which, and how b and its derivatives change with them.
         columns, values = local_basis(pace, timing.x, ORDERS_OF_PACE)
-        self._parts = [(columns, values * pace.c[columns])]
-        if course.unknowns:
-            columns, values = course.basis(timing.x)
-            self._parts.append((paces + columns, values))
-        self._columns = np.concatenate([columns for columns, _ in self._parts], axis=1)
+        self._columns, self._values = columns, values * pace.c[columns]
         shares = [use.share.slope[:, i] for use in timing.uses for i in range(use.share.slope.shape[1])]
-        self._slopes = np.concatenate([self._by_unknowns(slope) for slope in shares])
+        self._slopes = np.concatenate([np.einsum("mo,omj->mj", slope, self._values) for slope in shares])
         self._where = np.tile(self._columns, (len(shares), 1))
         self._both = np.concatenate([np.full(use.share.value.size, use.both) for use in timing.uses])
         self.beyond = self._excess(timing)
@@ -125,20 +118,6 @@ class _Program:
         self._program = LinearProgram(np.append(self._gradient, _PENALTY))
         self._known = np.zeros((2, len(self._both)), dtype=bool)
         self._rows = np.empty(0, dtype=int), np.empty(0)
-        held = course.held()
-        self._held = np.zeros(0 if held is None else held.shape[0])
-        if held is not None:
-            held = held.toarray()
-            columns = np.broadcast_to(paces + np.arange(held.shape[1]), held.shape)
-            self._program.add_rows(self._held, self._held, columns, held)
-
-    def _by_unknowns(self, slope: np.ndarray) -> np.ndarray:
-        """From slopes by b, P and their derivatives, shape (M, D), to slopes by the unknowns that count."""
-        blocks, first = [], 0
-        for _, values in self._parts:
-            blocks.append(np.einsum("mo,omj->mj", slope[:, first : first + len(values)], values))
-            first += len(values)
-        return np.concatenate(blocks, axis=1)
 
     def step(self, trust: float, tolerance: float) -> tuple[float, tuple[float, Timing] | None]:
         """Return the gain that is predicted, and what was gained and the timing that gains it; None: not enough."""
@@ -188,16 +167,10 @@ class _Program:
     def _bound(self, rest: np.ndarray, trust: float) -> None:
         """Tell the program what is known of shares and steps."""
         rows, signs = self._rows
-        high = np.concatenate([self._held, self._allowed - signs * rest[rows]])
-        low = np.concatenate([self._held, np.full(len(rows), -np.inf)])
-        self._program.bound_rows(low, high)
+        self._program.bound_rows(np.full(len(rows), -np.inf), self._allowed - signs * rest[rows])
         count = len(self._gradient)
-        widest = np.full(count + 1, trust)
-        least = np.concatenate(
-            [np.full(self._paces, -trust / (1.0 + trust)), np.full(count - self._paces, -trust), [0]]
-        )
-        widest[-1] = np.inf
-        self._program.bound(least, widest)
+        least, most = np.full(count, -trust / (1.0 + trust)), np.full(count, trust)
+        self._program.bound(np.append(least, 0.0), np.append(most, np.inf))
 
     def _add(self, high: np.ndarray, low: np.ndarray, rest: np.ndarray) -> bool:
         """Add limits to the program from above and from below, but those that it has; whether there were any."""
@@ -215,12 +188,11 @@ class _Program:
     def _moved(self, change: np.ndarray) -> Timing | None:
         """Evaluate a change; None if the rods cannot do it."""
         old = self._timing
-        pace = BSpline(old.pace.t, old.pace.c * (1.0 + change[: self._paces]), old.pace.k)
-        problem = replace(old.problem, course=old.problem.course.moved(change[self._paces :]))
-        moves = np.concatenate([np.einsum("omj,mj->om", values, change[columns]) for columns, values in self._parts])
+        pace = BSpline(old.pace.t, old.pace.c * (1.0 + change), old.pace.k)
+        moves = np.einsum("omj,mj->om", self._values, change[self._columns])
         q = old.turned.q.value + np.einsum("mkd,dm->mk", old.turned.q.slope, moves)
         try:
-            return evaluated(problem, pace, old.x, q, old.turned.poses)
+            return evaluated(old.problem, pace, old.x, q, old.turned.poses)
         except PCRError:
             return None
 

@@ -1,106 +1,202 @@
-"""A course whose path between way-points is free too."""
+"""The path between way-points is free too: from the plan of a given path to the fastest of all near it."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
-from scipy.interpolate import BSpline
+from scipy.interpolate import BPoly, CubicSpline
 
-from ...errors import ModelError
+from ...errors import ConvergenceError, ModelError
 from ...loop.references.blended import Blended
 from ...loop.references.trajectory import PickAndPlace, Trajectory
-from .course import Course
-from .pace import local_basis
-from .path import fitted
+from ...plant.rods.physics import require_plain
+from ...plant.statics.equilibria import Equilibria
+from ...plant.statics.symbolic import rod_unknowns
+from .angles import followed
+from .collocation import NODES, Collocated, slopes_at, solved
+from .limits import Asked, Use, uses
+from .linear import Linear
+from .pace import times
+from .timed_path import Move
+from .timing import Problem, Timing
 
-_DEGREE, _FLAT = 7, 4  # at each end so many coefficients are alike: three derivatives vanish there
-_SAMPLES = 4001
 _MOST_POINTS = 100  # more are samples of a path, and no way-points
+_FEWEST = 4  # intervals from one way-point to the next
+FINE = 10 * len(NODES)  # points of an interval where limits are checked
+_LARGEST_EXCESS = 1e-3
+_NEAR = 0.9  # share of a limit from which on it is kept from the start
+_BY_BOUNDS = {"motor rate", "change of rate", "motor angle", "tip region"}  # kept always
 
 
-class FreeCourse:
-    """P(x) is a spline, of which each coefficient may move across the path; the way-points stay.
+@dataclass(frozen=True, eq=False)
+class Hermite(Move):
+    """Quintics through position, velocity and acceleration at the ends of intervals.
 
-    Along the path they do not move: that would be another pace, which b is already.
-
-    Parameters
+    Attributes
     ----------
-    spline : BSpline
-        P on equal pieces, with its first and its last four coefficients alike.
-    fixed : ndarray
-        The x of the way-points between the ends.
-    unit : float
-        Of the unknowns, by which coefficients move [m].
+    t : ndarray, shape (K + 1,)
+        [s].
+    samples : ndarray, shape (K + 1, 3, 2)
     """
 
-    def __init__(self, spline: BSpline, fixed: np.ndarray, unit: float) -> None:
-        self.spline, self.fixed, self.unit = spline, fixed, unit
-        inner = np.arange(_FLAT, len(spline.c) - _FLAT)
-        middles = np.array([spline.t[k + 1 : k + 1 + _DEGREE].mean() for k in inner])
-        tangents = spline(middles, nu=1)
-        tangents = tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
-        self._across = np.zeros((len(spline.c), 2))
-        self._across[inner] = unit * np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
+    t: np.ndarray
+    samples: np.ndarray
 
     @property
-    def unknowns(self) -> int:
-        """See `Course`."""
-        return len(self.spline.c) - 2 * _FLAT
+    def duration(self) -> float:
+        """See `Move`."""
+        return float(self.t[-1])
 
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """See `Course`."""
-        return np.stack([self.spline(x, nu=order) for order in range(5)])
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """See `Move`."""
+        spline = BPoly.from_derivatives(self.t, self.samples)
+        return np.stack([spline(t), spline.derivative(1)(t), spline.derivative(2)(t)], axis=1)
 
-    def basis(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Course`."""
-        columns, values = local_basis(self.spline, x, 5)
-        both = np.concatenate([values * self._across[columns, axis] for axis in (0, 1)])
-        # Those at the ends do not move: their values are zero, whatever their number.
-        return np.clip(columns - _FLAT, 0, self.unknowns - 1), both
-
-    def held(self) -> Any | None:
-        """See `Course`."""
-        if not len(self.fixed):
-            return None
-        columns, both = self.basis(self.fixed)
-        rows = np.repeat(np.arange(len(self.fixed)), columns.shape[1])
-        shape = (len(self.fixed), self.unknowns)
-        parts = [sparse.coo_array((both[5 * axis].ravel(), (rows, columns.ravel())), shape) for axis in (0, 1)]
-        return sparse.vstack(parts).tocsr()
-
-    def moved(self, change: np.ndarray) -> FreeCourse:
-        """See `Course`."""
-        coefficients = self.spline.c.copy()
-        coefficients[_FLAT:-_FLAT] += change[:, None] * self._across[_FLAT:-_FLAT]
-        return FreeCourse(BSpline(self.spline.t, coefficients, _DEGREE), self.fixed, self.unit)
+    def breaks(self) -> np.ndarray:
+        """See `Move`."""
+        return self.t
 
 
-def freed(course: Course, points: np.ndarray, pieces: int, unit: float) -> FreeCourse:
-    """Let go of a course between way-points.
+@dataclass(frozen=True, eq=False)
+class Freed:
+    """A motion through way-points, and what it asks for at points ten times as dense as those where limits were kept.
+
+    Attributes
+    ----------
+    move : Hermite
+    t : ndarray, shape (M,)
+        [s].
+    asked : Asked
+    uses : list of Use
+    grid : int
+        Points at which limits were kept.
+    iterations : int
+    """
+
+    move: Hermite
+    t: np.ndarray
+    asked: Asked
+    uses: list[Use]
+    grid: int
+    iterations: int
+
+
+def freed(timing: Timing, points: np.ndarray, intervals: int, allowed: float) -> Freed:
+    """Find the fastest motion through way-points near that of a given path.
 
     Parameters
     ----------
-    course : Course
+    timing : Timing
+        To start from.
     points : ndarray, shape (W, 2)
-        In their order [m]; the ends of the course are kept anyway.
-    pieces : int
-        Of the spline.
-    unit : float
-        See `FreeCourse`.
+        In their order [m].
+    intervals : int
+        About so many.
+    allowed : float
+        Share of the limits that may be used.
+
+    Raises
+    ------
+    ModelError
+        The rods are not plain.
+    InfeasibleError
+        The nonlinear program was not solved.
+    ConvergenceError
+        A limit is exceeded between the points where it was kept.
     """
-    x = np.linspace(0.0, 1.0, _SAMPLES)
-    p = course(x)[0]
-    spline = fitted(x, p, np.linspace(0.0, 1.0, pieces + 1), _DEGREE, flat=_FLAT)
-    fixed: list[float] = []
-    first = 0
+    problem = timing.problem
+    require_plain(problem.pose.robot, "a free path (free)")
+    hands, rods = rod_unknowns(problem.pose.robot, problem.pose)
+    motion = _started(timing, points, intervals, rods)
+    # Most limits are far: those that turn out not to be are added.
+    kinds = frozenset(use.limit for use in timing.uses if use.largest.max() > _NEAR) - _BY_BOUNDS
+    while True:
+        motion = solved(motion, problem, hands, points, allowed, kinds)
+        found = _checked(motion, problem)
+        beyond = {use.limit for use in found.uses if use.largest.max() > 1.0 + _LARGEST_EXCESS}
+        if not beyond:
+            return found
+        new = beyond - kinds - _BY_BOUNDS
+        if not new:
+            worst = max(found.uses, key=lambda use: float(use.largest.max()))
+            raise ConvergenceError(
+                f"the plan of a free path exceeds the limit on {worst.limit} by "
+                f"{100 * (worst.largest.max() - 1.0):.3g} % at {found.t[worst.largest.argmax()]:.4f} s, between the "
+                f"points where it was kept; take more cells than {intervals}",
+                residual=float(worst.largest.max()) - 1.0,
+                iterations=found.iterations,
+                last=motion.states,
+            )
+        kinds |= new
+
+
+def _started(timing: Timing, points: np.ndarray, intervals: int, rods: Callable[..., np.ndarray]) -> Collocated:
+    """The motion along the given path, in intervals of nearly equal length."""
+    t, n = times(timing.pace, timing.x), timing.turned.q.value.shape[1]
+    moved, turned = timing.moved, timing.turned
+    spline = CubicSpline(t, np.concatenate([moved.path[0], moved.velocity.value, turned.q.value, turned.rate.value,
+                                            moved.acceleration.value], axis=1))  # fmt: skip
+    fine = np.linspace(0.0, t[-1], 4001)
+    tips, passed, first = spline(fine)[:, :2], [0.0], 0
     for point in points[1:-1]:
         # The nearest place that comes after the one before: a path may cross itself.
-        away = np.linalg.norm(p[first:] - point, axis=1)
-        first += _first_valley(away)
-        fixed.append(float(x[first]))
-    return FreeCourse(spline, np.array(fixed), unit)
+        first += _first_valley(np.linalg.norm(tips[first:] - point, axis=1))
+        passed.append(float(fine[first]))
+    spans = np.diff([*passed, t[-1]])
+    counts = np.maximum(_FEWEST, np.rint(intervals * spans / t[-1]).astype(int))
+    steps = np.repeat(spans / counts, counts)
+    ends = np.concatenate([[0.0], np.cumsum(steps)])
+    x = spline(ends)[:, : 4 + 2 * n]
+    inside = spline((ends[:-1, None] + steps[:, None] * NODES).ravel())
+    unknowns = rods(inside[:, :2], inside[:, 4 : 4 + n])
+    shape = (len(steps), len(NODES))
+    changes = np.diff(x[:, 4 + n :], axis=0) / steps[:, None]
+    return Collocated(x, changes, inside[:, -2:].reshape(*shape, 2), unknowns.reshape(*shape, 2 * n), spans, counts)
+
+
+def _checked(motion: Collocated, problem: Problem) -> Freed:
+    """What a motion asks for, by statics at every point of a dense grid."""
+    robot, carrier, steps = problem.pose.robot, problem.carrier, motion.steps
+    n = robot.n_rods
+    ends = np.concatenate([[0.0], np.cumsum(steps)])
+    q, u = motion.states[:, 4 : 4 + n], motion.states[:, 4 + n :]
+
+    def forces(tips: np.ndarray, angles: np.ndarray) -> Equilibria:
+        poses = followed(problem.pose, tips, angles, None)
+        if not poses.solved.all():
+            row = int(np.argmin(poses.solved))
+            raise ConvergenceError(
+                f"the rods could not be followed along the planned path at p = {tips[row]} m: {poses.reason[row]}",
+                residual=float("nan"),
+                iterations=motion.iterations,
+                last=angles[row],
+            )
+        return poses
+
+    force = forces(motion.states[:, :2], q).force
+    acceleration = (carrier.weight - force - robot.drag * motion.states[:, 2:4]) / carrier.mass
+    move = Hermite(ends, np.stack([motion.states[:, :2], motion.states[:, 2:4], acceleration], axis=1))
+
+    share = np.arange(FINE) / FINE
+    row = np.append(np.repeat(np.arange(len(steps)), FINE), len(steps) - 1)
+    part = np.append(np.tile(share, len(steps)), 1.0)
+    since = part * steps[row]
+    t = ends[row] + since
+    angles = q[row] + since[:, None] * u[row] + since[:, None] ** 2 / 2 * motion.changes[row]
+    rates = u[row] + since[:, None] * motion.changes[row]
+    samples = move(t)
+    poses = forces(samples[:, 0], angles)
+    jerk = np.einsum("ms,msd->md", slopes_at(part), motion.accelerations[row]) / steps[row][:, None]
+    acceleration = (carrier.weight - poses.force - robot.drag * samples[:, 1]) / carrier.mass
+    velocity, a, j, turned, rate, change, torque = (
+        Linear(value, np.empty((*value.shape, 0)))
+        for value in (samples[:, 1], acceleration, jerk, angles, rates, motion.changes[row], poses.motor_torque)
+    )
+    asked = Asked(samples[:, 0], velocity, a, j, turned, rate, change, torque, poses, problem.pose)
+    grid = len(steps) * len(NODES) + 1
+    return Freed(move, t, asked, uses(problem.limits, asked), grid, motion.iterations)
 
 
 def _first_valley(away: np.ndarray) -> int:

@@ -13,9 +13,9 @@ from ...linearisation.pose_limits import PoseLimits
 from ...loop.scene.scene import Scene
 from ...plant.rods.chart import LEAST_CRITICAL_LOAD, critical_load
 from ...plant.statics.equilibria import Equilibria
-from .angles import Angles, followed
+from ...plant.statics.equilibrium import Equilibrium
+from .angles import followed
 from .linear import Linear
-from .motion import Motion
 
 # Of the limits, by their names; those on motor angles and on the tip's region are intervals.
 UNITS = {
@@ -94,6 +94,35 @@ class PlanLimits:
 
 
 @dataclass(frozen=True, eq=False)
+class Asked:
+    """What a motion asks for at M points.
+
+    Attributes
+    ----------
+    p : ndarray, shape (M, 2)
+        [m].
+    velocity, acceleration, jerk : Linear, two components
+        Of the tip.
+    q, rate, change, torque : Linear, n components
+        Motor angles, their rates, the change of these, and torques.
+    poses : Equilibria
+    pose : Equilibrium
+        From which their branch was followed.
+    """
+
+    p: np.ndarray
+    velocity: Linear
+    acceleration: Linear
+    jerk: Linear
+    q: Linear
+    rate: Linear
+    change: Linear
+    torque: Linear
+    poses: Equilibria
+    pose: Equilibrium
+
+
+@dataclass(frozen=True, eq=False)
 class Use:
     """Share of a limit that is used at M points: 1 is all of it.
 
@@ -116,62 +145,62 @@ class Use:
         return np.asarray((np.abs(self.share.value) if self.both else self.share.value).max(axis=1))
 
 
-def uses(limits: PlanLimits, moved: Motion, turned: Angles) -> list[Use]:
+def uses(limits: PlanLimits, asked: Asked) -> list[Use]:
     """Every limit that there is, by what the motion uses of it."""
-    robot = turned.poses.robot
+    robot = asked.poses.robot
     low, high = robot.angle_limits.T
     middle, half = (low + high) / 2, (high - low) / 2
-    angle = Linear((turned.q.value - middle) / half, turned.q.slope / half[:, None])
+    angle = Linear((asked.q.value - middle) / half, asked.q.slope / half[:, None])
     found = [
-        Use("motor rate", (1.0 / limits.rate) * turned.rate, both=True),
-        Use("change of rate", (1.0 / limits.acceleration) * turned.acceleration, both=True),
-        Use("motor torque", (1.0 / limits.torque) * turned.torque, both=True),
+        Use("motor rate", (1.0 / limits.rate) * asked.rate, both=True),
+        Use("change of rate", (1.0 / limits.acceleration) * asked.change, both=True),
+        Use("motor torque", (1.0 / limits.torque) * asked.torque, both=True),
         Use("motor angle", angle, both=True),
     ]
     for name, limit, vector in (
-        ("tip speed", limits.tip_speed, moved.velocity),
-        ("tip acceleration", limits.tip_acceleration, moved.acceleration),
-        ("tip jerk", limits.tip_jerk, moved.jerk),
+        ("tip speed", limits.tip_speed, asked.velocity),
+        ("tip acceleration", limits.tip_acceleration, asked.acceleration),
+        ("tip jerk", limits.tip_jerk, asked.jerk),
     ):
         if limit != math.inf:
             found.append(Use(name, (1.0 / limit) * vector.norm(), both=False))
     if limits.tip_lower is not None and limits.tip_upper is not None:
         corners = np.array([limits.tip_lower, limits.tip_upper])
         middle, half = corners.mean(axis=0), np.diff(corners, axis=0)[0] / 2
-        p = moved.path[0]
-        found.append(Use("tip region", Linear((p.value - middle) / half, p.slope / half[:, None]), both=True))
+        none = np.zeros((*asked.p.shape, asked.q.slope.shape[2]))  # of the path, which is given
+        found.append(Use("tip region", Linear((asked.p - middle) / half, none), both=True))
     if limits.stiffness > 0.0:
-        found.append(_stiffness(limits.stiffness, turned))
-    if limits.rod_margin > -math.inf and turned.poses.method == "closed_form":
-        found.append(_rod_margin(limits.rod_margin, turned))
+        found.append(_stiffness(limits.stiffness, asked))
+    if limits.rod_margin > -math.inf and asked.poses.method == "closed_form":
+        found.append(_rod_margin(limits.rod_margin, asked))
     return found
 
 
-def _stiffness(least: float, turned: Angles) -> Use:
+def _stiffness(least: float, asked: Asked) -> Use:
     """Least eigenvalue of K: the limit over it."""
-    poses = turned.poses
+    poses = asked.poses
     values, vectors = np.linalg.eigh((poses.dforce_dp + poses.dforce_dp.transpose(0, 2, 1)) / 2)
     softest, vector = values[:, 0], vectors[:, :, 0]
     # Where the pose is not even stable, what counts is that it is far beyond the limit.
     share = least / np.maximum(softest, 0.1 * least)
     slope = np.zeros_like(poses.q)
-    if turned.q.slope.size and share.max() > _WATCHED:
+    if asked.q.slope.size and share.max() > _WATCHED:
         for i in range(poses.q.shape[1]):
-            change = (_turned(turned, i).dforce_dp - poses.dforce_dp) / _ANGLE
+            change = (_turned(asked, i).dforce_dp - poses.dforce_dp) / _ANGLE
             slope[:, i] = np.einsum("mi,mij,mj->m", vector, change, vector)
     by_angle = -(share**2)[:, None] / least * slope
-    by_own = np.einsum("mi,mid->md", by_angle, turned.q.slope)[:, None]
+    by_own = np.einsum("mi,mid->md", by_angle, asked.q.slope)[:, None]
     return Use("stiffness", Linear(share[:, None], by_own), both=False)
 
 
-def _rod_margin(least: float, turned: Angles) -> Use:
+def _rod_margin(least: float, asked: Asked) -> Use:
     """Lambda over lambda_c, over the most that is allowed."""
-    poses, most = turned.poses, 1.0 - least
+    poses, most = asked.poses, 1.0 - least
     here, slope = loads(poses, _WATCHED * most), np.zeros_like(poses.q)
-    if turned.q.slope.size and here.max() > _WATCHED * most:
+    if asked.q.slope.size and here.max() > _WATCHED * most:
         # Rods do not couple at a held tip: all motors at once.
-        slope = (loads(_turned(turned, slice(None)), _WATCHED * most) - here) / _ANGLE
-    return Use("rod margin", (1.0 / most) * Linear(here, slope[:, :, None] * turned.q.slope), both=False)
+        slope = (loads(_turned(asked, slice(None)), _WATCHED * most) - here) / _ANGLE
+    return Use("rod margin", (1.0 / most) * Linear(here, slope[:, :, None] * asked.q.slope), both=False)
 
 
 def loads(poses: Equilibria, exact_from: float) -> np.ndarray:
@@ -184,9 +213,9 @@ def loads(poses: Equilibria, exact_from: float) -> np.ndarray:
     return np.asarray(load / critical)
 
 
-def _turned(turned: Angles, motors: int | slice) -> Equilibria:
+def _turned(asked: Asked, motors: int | slice) -> Equilibria:
     """Poses with some motors turned a little more."""
-    poses = turned.poses
+    poses = asked.poses
     q = poses.q.copy()
     q[:, motors] += _ANGLE
-    return followed(turned.stand.pose, poses.p, q, poses)
+    return followed(asked.pose, poses.p, q, poses)

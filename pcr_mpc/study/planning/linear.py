@@ -51,6 +51,10 @@ class Linear:
         """Product with matrices that do not change, shape (M, l, k)."""
         return Linear(np.einsum("mlk,mk->ml", matrices, self.value), np.einsum("mlk,mkd->mld", matrices, self.slope))
 
+    def less(self, matrices: np.ndarray, vectors: np.ndarray) -> Linear:
+        """Without the products of matrices, shape (M, k, l), and vectors, (M, l), that do not change."""
+        return Linear(self.value - np.einsum("mkl,ml->mk", matrices, vectors), self.slope)
+
     def norm(self) -> Linear:
         """Length of the vector at each point; of one that is zero, the slope is zero too."""
         length = np.linalg.norm(self.value, axis=1, keepdims=True)

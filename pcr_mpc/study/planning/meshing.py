@@ -10,7 +10,6 @@ from scipy import sparse
 from scipy.interpolate import CubicSpline
 from scipy.sparse.linalg import spsolve
 
-from .course import PacedPath
 from .pace import constant_pace, duration, spline_of, times, unit_splines
 from .timing import Timing, evaluated
 
@@ -48,14 +47,12 @@ def repaced(timing: Timing, cells: int, pieces: int) -> Timing:
     Parameters
     ----------
     timing : Timing
-        Of a `PacedPath`.
     cells : int
         Of b.
     pieces : int
         Of the new course's pace; few, so that it is smooth: the rest is left to b.
     """
     old = timing.problem.course
-    assert isinstance(old, PacedPath)
     x = np.linspace(0.0, 1.0, _SAMPLES)
     when = times(timing.pace, x)
     place = old.nominal(x)

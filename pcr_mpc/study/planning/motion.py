@@ -20,8 +20,7 @@ import numpy as np
 
 from .linear import Linear
 
-ORDERS_OF_PACE, ORDERS_OF_PATH = 4, 5  # b to b''', P to P''''
-BY_PACE, BY_PATH_TOO = ORDERS_OF_PACE, ORDERS_OF_PACE + 2 * ORDERS_OF_PATH
+ORDERS_OF_PACE = 4  # b to b'''
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class Motion:
     velocity, acceleration, jerk : Linear, two components
     force : tuple of Linear
         F, F', F''.
-    path : tuple of Linear
+    path : tuple of ndarray, shape (M, 2)
         P, P', P''.
     """
 
@@ -55,10 +54,10 @@ class Motion:
     acceleration: Linear
     jerk: Linear
     force: tuple[Linear, Linear, Linear]
-    path: tuple[Linear, Linear, Linear]
+    path: tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, width: int) -> Motion:
+def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, *, slopes: bool) -> Motion:
     """Compute motion and forces.
 
     Parameters
@@ -68,14 +67,12 @@ def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, width: int) -> 
     path : ndarray, shape (5, M, 2)
         P and its derivatives.
     carrier : Carrier
-    width : int
-        Of the slopes: 0 for none, BY_PACE by b to b''', BY_PATH_TOO then by x of P to P'''', then by y.
+    slopes : bool
+        Whether to know them, by b to b'''.
     """
-    b, b1, b2, b3 = (_unknown(values[:, None], (order,), width) for order, values in enumerate(pace))
-    first = ORDERS_OF_PACE
-    p, p1, p2, p3, p4 = (
-        _unknown(values, (first + order, first + ORDERS_OF_PATH + order), width) for order, values in enumerate(path)
-    )
+    width = ORDERS_OF_PACE if slopes else 0
+    b, b1, b2, b3 = (_unknown(values, order, width) for order, values in enumerate(pace))
+    p1, p2, p3, p4 = (Linear(values, np.zeros((*values.shape, width))) for values in path[1:])
     theta = b.sqrt()
     theta1 = b1 / (2.0 * theta)
     theta2 = (b2 - 2.0 * (theta1 * theta1)) / (2.0 * theta)
@@ -87,12 +84,11 @@ def motion(pace: np.ndarray, path: np.ndarray, carrier: Carrier, width: int) -> 
     )
     f, f1, f2 = (-carrier.mass * a - carrier.drag * v for a, v in zip(acceleration, speed, strict=True))
     force = Linear(f.value + carrier.weight, f.slope), f1, f2
-    return Motion(theta, b, b1, speed[0], acceleration[0], acceleration[1] * theta, force, (p, p1, p2))
+    return Motion(theta, b, b1, speed[0], acceleration[0], acceleration[1] * theta, force, (path[0], path[1], path[2]))
 
 
-def _unknown(values: np.ndarray, places: tuple[int, ...], width: int) -> Linear:
-    slope = np.zeros((*values.shape, width))
-    for component, place in enumerate(places):
-        if place < width:
-            slope[:, component, place] = 1.0
-    return Linear(values, slope)
+def _unknown(values: np.ndarray, place: int, width: int) -> Linear:
+    slope = np.zeros((len(values), 1, width))
+    if width:
+        slope[:, 0, place] = 1.0
+    return Linear(values[:, None], slope)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from tqdm import tqdm
@@ -13,20 +12,19 @@ from ...errors import ConvergenceError, InfeasibleError, ModelError, PCRError, c
 from ...loop.scene.scene import Scene
 from .course import paced
 from .fastest import faster
-from .free import freed, way_points
+from .free import Freed, freed, way_points
 from .limits import PlanLimits
 from .meshing import FINE, points, repaced, with_points
 from .motion import Carrier
 from .pace import cells_of, spline_of, times
 from .path import TipPath, path_of
 from .starting import STATICS, evened, started, where
-from .timed_path import TimedPath
-from .timing import Problem, Timing, evaluated
+from .timed_path import Paced, TimedPath
+from .timing import Problem, Timing
 
 _CELL = 1e-2  # s
 _FEWEST, _MOST = 80, 240  # cells
 _CELLS_PER_PIECE = 5
-_FREE_PIECES, _FREE_UNIT = 40, 0.05  # of a free path's spline; of its length, by which it moves in units of trust
 _ITERATIONS = (40, 12, 6)
 _GAINS = (1e-2, 1e-3)  # of the duration, that are none: roughly, and in the end
 _ALLOWED = 1.0 - 5e-4  # share of the limits that is used, so that they are kept between the points too
@@ -114,13 +112,10 @@ def plan_timing(
         timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
         timing = faster(timing, most=_ITERATIONS[1], trust=0.3, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
         if free:
-            course = freed(timing.problem.course, points_between, _FREE_PIECES, _FREE_UNIT * path.length)
-            problem = replace(timing.problem, course=course)
-            timing = evaluated(problem, timing.pace, timing.x, timing.turned.q.value, timing.turned.poses)
-            timing = faster(timing, most=_ITERATIONS[0], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
+            found = freed(timing, points_between, wanted, _ALLOWED)
+            return _free_result(scene.name, found, path, limits, iterations + found.iterations)
         timing, fine = refined(timing, told)
-    deviation = path.deviation + (_distance(path, fine.moved.path[0].value) if free else 0.0)
-    return _result(scene.name, timing, fine, deviation, iterations)
+    return _result(scene.name, timing, fine, path.deviation, iterations)
 
 
 def carrier_of(scene: Scene, span: float) -> Carrier:
@@ -214,20 +209,42 @@ def _distance(path: TipPath, tips: np.ndarray) -> float:
 
 def _result(name: str, timing: Timing, fine: Timing, deviation: float, iterations: int) -> TimedPath:
     moved, turned = fine.moved, fine.turned
-    steps = np.linalg.norm(np.diff(moved.path[0].value, axis=0), axis=1)
     return TimedPath(
         name,
-        timing.problem.course,
-        spline_of(timing.pace.c),
+        Paced(timing.problem.course, spline_of(timing.pace.c)),
         timing.problem.limits,
         deviation,
         len(timing.x),
         t=times(fine.pace, fine.x),
-        s=np.concatenate([[0.0], np.cumsum(steps)]),
-        motion=np.stack([moved.path[0].value, moved.velocity.value, moved.acceleration.value], axis=1),
+        s=_lengths(moved.path[0]),
+        motion=np.stack([moved.path[0], moved.velocity.value, moved.acceleration.value], axis=1),
         q=turned.q.value.copy(),
         rates=turned.rate.value.copy(),
         kinds=tuple(use.limit for use in fine.uses),
         shares=fine.shares,
         iterations=iterations,
     )
+
+
+def _free_result(name: str, found: Freed, path: TipPath, limits: PlanLimits, iterations: int) -> TimedPath:
+    asked = found.asked
+    return TimedPath(
+        name,
+        found.move,
+        limits,
+        path.deviation + _distance(path, asked.p),
+        found.grid,
+        t=found.t,
+        s=_lengths(asked.p),
+        motion=np.stack([asked.p, asked.velocity.value, asked.acceleration.value], axis=1),
+        q=asked.q.value.copy(),
+        rates=asked.rate.value.copy(),
+        kinds=tuple(use.limit for use in found.uses),
+        shares=np.stack([use.largest for use in found.uses]),
+        iterations=iterations,
+    )
+
+
+def _lengths(tips: np.ndarray) -> np.ndarray:
+    """From the start to each point [m]."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(tips, axis=0), axis=1))])

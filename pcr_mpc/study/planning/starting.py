@@ -11,7 +11,6 @@ from scipy.interpolate import CubicSpline
 from ...errors import ConvergenceError, InfeasibleError, PCRError
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.free_tip import inverse_statics
-from .course import PacedPath
 from .meshing import points
 from .pace import cells_of, constant_pace, spline_of
 from .path import TipPath
@@ -112,7 +111,6 @@ def _resting(problem: Problem, path: TipPath, x: np.ndarray) -> np.ndarray:
             raise type(error)(f"{where(length, tip)}: {error}", **error.details, s=float(length)) from None
         found.append(pose.q)
     course = problem.course
-    assert isinstance(course, PacedPath)
     return np.asarray(CubicSpline(s, np.array(found))(np.clip(course.nominal(x), 0.0, path.length)))
 
 
@@ -133,8 +131,8 @@ def _require_rest(still: Timing, path: TipPath) -> None:
         "rod margin": f"leaves a rod margin of {1 - shares[limit, at] * (1 - still.problem.limits.rod_margin):.4g}, "
         f"where {still.problem.limits.rod_margin:.4g} is to be kept",
     }.get(kind, f"uses {shares[limit, at]:.4g} times what is allowed")
-    p = still.moved.path[0].value[at]
-    s = float(still.problem.course.nominal(still.x[at]))  # type: ignore[attr-defined]
+    p = still.moved.path[0][at]
+    s = float(still.problem.course.nominal(still.x[at]))
     raise InfeasibleError(
         f"{where(s, p)} cannot be kept at any speed: to rest there {value} ({kind}); move the path, or allow more",
         status="infeasible at rest",

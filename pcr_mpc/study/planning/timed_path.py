@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,13 +11,67 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from ...frozen import Frozen
-from .course import Course
+from .course import PacedPath
 from .limits import UNITS, PlanLimits
 from .pace import cells_of, duration, places, times
 
 ACTIVE = 0.95  # share of a limit from which on it acts
 _HEADER = "t_s,x_m,y_m,vx_m_s,vy_m_s,ax_m_s2,ay_m_s2"
 _ROW = 5e-4  # s
+
+
+class Move(ABC):
+    """A motion from rest to rest."""
+
+    @property
+    @abstractmethod
+    def duration(self) -> float:
+        """[s]."""
+
+    @abstractmethod
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Position [m], velocity [m/s] and acceleration [m/s^2] at times within the duration, (len(t), 3, 2)."""
+
+    @abstractmethod
+    def breaks(self) -> np.ndarray:
+        """Times at which its pieces meet [s]."""
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        """The same at any times."""
+        t = np.asarray(t, dtype=float)
+        samples = self.at(np.clip(t, 0.0, self.duration))
+        samples[(t < 0.0) | (t > self.duration), 1:] = 0.0
+        return samples
+
+
+@dataclass(frozen=True, eq=False)
+class Paced(Move):
+    """A course at a pace.
+
+    Attributes
+    ----------
+    course : PacedPath
+    pace : BSpline
+    """
+
+    course: PacedPath
+    pace: BSpline
+
+    @property
+    def duration(self) -> float:
+        """See `Move`."""
+        return duration(self.pace)
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """See `Move`."""
+        x = places(self.pace, t)
+        p, p1, p2 = self.course(x)[:3]
+        b, b1 = self.pace(x)[:, None], self.pace(x, nu=1)[:, None]
+        return np.stack([p, p1 * np.sqrt(b), p2 * b + p1 * b1 / 2.0], axis=1)
+
+    def breaks(self) -> np.ndarray:
+        """See `Move`."""
+        return times(self.pace, np.linspace(0.0, 1.0, cells_of(self.pace) + 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +82,7 @@ class TimedPath(Frozen):
     ----------
     name : str
         Of the scene.
-    course : Course
-    pace : BSpline
+    move : Move
     limits : PlanLimits
     deviation : float
         Greatest distance of the path from the one that was given [m].
@@ -50,8 +104,7 @@ class TimedPath(Frozen):
     """
 
     name: str
-    course: Course
-    pace: BSpline
+    move: Move
     limits: PlanLimits
     deviation: float
     grid: int
@@ -67,7 +120,7 @@ class TimedPath(Frozen):
     @property
     def duration(self) -> float:
         """[s]."""
-        return duration(self.pace)
+        return self.move.duration
 
     @property
     def excess(self) -> float:
@@ -81,13 +134,7 @@ class TimedPath(Frozen):
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """Position [m], velocity [m/s] and acceleration [m/s^2] at times t, shape (len(t), 3, 2)."""
-        t = np.asarray(t, dtype=float)
-        x = places(self.pace, t)
-        p, p1, p2 = self.course(x)[:3]
-        b, b1 = self.pace(x)[:, None], self.pace(x, nu=1)[:, None]
-        samples = np.stack([p, p1 * np.sqrt(b), p2 * b + p1 * b1 / 2.0], axis=1)
-        samples[(t < 0.0) | (t > self.duration), 1:] = 0.0
-        return samples
+        return self.move(t)
 
     def csv(self, step: float = _ROW) -> str:
         """Table for ``[reference] kind = "file"``: time, position, velocity and acceleration, to all digits.
@@ -98,9 +145,9 @@ class TimedPath(Frozen):
             Longest time from row to row [s].
         """
         # Rows where pieces of the timing meet: between them the motion is so smooth that their spline is the same.
-        cells = cells_of(self.pace)
-        longest = float(np.diff(times(self.pace, np.linspace(0.0, 1.0, cells + 1))).max())
-        t = times(self.pace, np.linspace(0.0, 1.0, cells * math.ceil(longest / step) + 1))
+        breaks = self.move.breaks()
+        count = math.ceil(float(np.diff(breaks).max()) / step)
+        t = np.interp(np.arange(count * (len(breaks) - 1) + 1) / count, np.arange(len(breaks)), breaks)
         rows = np.column_stack([t, self(t).reshape(len(t), 6)])
         return "\n".join([_HEADER, *(",".join(map(repr, row)) for row in rows.tolist())]) + "\n"
 

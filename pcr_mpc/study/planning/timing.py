@@ -10,9 +10,9 @@ from scipy.interpolate import BSpline, CubicSpline
 from ...plant.statics.equilibria import Equilibria
 from ...plant.statics.equilibrium import Equilibrium
 from .angles import Angles, Stand, angles, stood
-from .course import Course
-from .limits import PlanLimits, Use, uses
-from .motion import BY_PACE, BY_PATH_TOO, ORDERS_OF_PACE, Carrier, Motion, motion
+from .course import PacedPath
+from .limits import Asked, PlanLimits, Use, uses
+from .motion import ORDERS_OF_PACE, Carrier, Motion, motion
 from .pace import duration
 
 # Force of the rods that may be missing, in units of sum EI/L^2: on the way, and in the end.
@@ -25,14 +25,14 @@ class Problem:
 
     Attributes
     ----------
-    course : Course
+    course : PacedPath
     pose : Equilibrium
         Near the start.
     carrier : Carrier
     limits : PlanLimits
     """
 
-    course: Course
+    course: PacedPath
     pose: Equilibrium
     carrier: Carrier
     limits: PlanLimits
@@ -82,10 +82,8 @@ class Timing:
 
     def with_slopes(self) -> Timing:
         """Return the same, and how it changes."""
-        width = BY_PATH_TOO if self.problem.course.unknowns else BY_PACE
-        return _timing(
-            self.problem, self.pace, self.x, _moving(self.problem, self.pace, self.x, width), self.turned.stand
-        )
+        moved = _moving(self.problem, self.pace, self.x, slopes=True)
+        return _timing(self.problem, self.pace, self.x, moved, self.turned.stand)
 
     def near(self, x: np.ndarray) -> Equilibria:
         """Poses at the points nearest to x."""
@@ -107,15 +105,27 @@ def evaluated(
     q : ndarray, shape (len(x), n)
         Guess [rad].
     """
-    moved = _moving(problem, pace, x, 0)
+    moved = _moving(problem, pace, x, slopes=False)
     return _timing(problem, pace, x, moved, stood(moved, problem.pose, q, near, tolerance))
 
 
-def _moving(problem: Problem, pace: BSpline, x: np.ndarray, width: int) -> Motion:
+def _moving(problem: Problem, pace: BSpline, x: np.ndarray, *, slopes: bool) -> Motion:
     values = np.stack([pace(x, nu=order) for order in range(ORDERS_OF_PACE)])
-    return motion(values, problem.course(x), problem.carrier, width)
+    return motion(values, problem.course(x), problem.carrier, slopes=slopes)
 
 
 def _timing(problem: Problem, pace: BSpline, x: np.ndarray, moved: Motion, stand: Stand) -> Timing:
     turned = angles(moved, stand, x)
-    return Timing(problem, pace, x, moved, turned, uses(problem.limits, moved, turned))
+    asked = Asked(
+        moved.path[0],
+        moved.velocity,
+        moved.acceleration,
+        moved.jerk,
+        turned.q,
+        turned.rate,
+        turned.acceleration,
+        turned.torque,
+        stand.poses,
+        stand.pose,
+    )
+    return Timing(problem, pace, x, moved, turned, uses(problem.limits, asked))
