@@ -291,7 +291,7 @@ def test_a_path_between_way_points_may_be_free(points_scene, planned):
     duration = points_scene.period * math.ceil((free.duration + 0.2) / points_scene.period)
     tracked = replace(points_scene, trajectory=free, duration=duration)
     summary = simulate(tracked, tracked.make_plant(), make_controller(tracked)).summary()
-    assert summary["max_mm"] < 0.1
+    assert summary["max_mm"] < 0.2  # the change of rate jumps, and is held for 5 ms
     with pytest.raises(ModelError, match="no way-points"):
         plan_timing(load_scene(MODELS / "scenes" / "circle_from_file.toml"), free=True)
     with pytest.raises(ModelError, match="is for uniform"):
