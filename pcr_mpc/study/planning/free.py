@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -113,8 +112,9 @@ def freed(timing: Timing, points: np.ndarray, intervals: int, allowed: float) ->
     motion = _started(timing, points, intervals, rods)
     # Most limits are far: those that turn out not to be are added.
     kinds = frozenset(use.limit for use in timing.uses if use.largest.max() > _NEAR) - _BY_BOUNDS
-    for attempt in itertools.count():
-        motion = solved(motion, problem, hands, points, allowed, kinds)
+    attempts = 0
+    while True:
+        motion, attempts = solved(motion, problem, hands, points, allowed, kinds), attempts + 1
         found = _checked(motion, problem)
         beyond = {use.limit for use in found.uses if use.largest.max() > 1.0 + _LARGEST_EXCESS}
         if not beyond:
@@ -122,7 +122,7 @@ def freed(timing: Timing, points: np.ndarray, intervals: int, allowed: float) ->
         new = beyond - kinds - _BY_BOUNDS
         worst = max(found.uses, key=lambda use: float(use.largest.max()))
         excess = float(worst.largest.max()) - 1.0
-        if not new and excess < _LITTLE and attempt < _MOST_ATTEMPTS:
+        if not new and excess < _LITTLE and attempts < _MOST_ATTEMPTS:
             allowed -= 1.5 * excess  # what is exceeded between the points is left at them
         elif not new:
             raise ConvergenceError(
