@@ -27,7 +27,7 @@ from ..loop.scene.scene import Scene
 from .packet import RESTING, Measurement, command_size, pack_measurement, unpack_command
 
 _PATIENCE = 120.0  # s, until the controller's process listens
-_HEAD_START = 0.05  # s
+_GREETING = 10.0  # s, until the first measurement is answered
 _SILENCE, _SILENCE_TIME = 5, 0.25  # periods at least, and s
 _SPIN = 1e-4  # s before a step is due, in which sleeping is too coarse
 
@@ -47,6 +47,7 @@ class HilRun:
         How much later than due each plant step began [s].
     round_trip : ndarray, shape (M,)
         From a measurement to its command, as far as they came [s]; NaN for those that did not come within their period.
+        The first period is left out: the clock starts when its command has come.
     rungs : ndarray, shape (M,)
         Of the commands, -1 for those that did not come.
     simulated : float
@@ -179,8 +180,8 @@ def _controller(scene: Scene, generated: bool, pipe: Connection) -> None:
     except Exception as error:  # whatever it is, who waits is told
         pipe.send(error)
         return
-    pipe.send(server.address)
     with _preferred():
+        pipe.send(server.address)
         server.serve(lambda text: print(f"{scene.name}: {text}", file=sys.stderr), until=pipe.poll)
     server.close()
     pipe.send(dict(server.counts))
@@ -206,8 +207,9 @@ def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[A
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.connect(address)
         wire.setblocking(False)
+        u = _greeted(wire, pack_measurement(_measured(scene, 0, 0.0, x, noise)), n)
         bar = tqdm(total=scene.n_periods, desc=scene.name, unit="period", disable=not progress)
-        began = time.perf_counter() + _HEAD_START
+        began = time.perf_counter()
         for step in range(count):
             due = began + step * plant.dt
             for data, now in _until(due, wire, command_size(n) + 1):
@@ -221,10 +223,10 @@ def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[A
             if step % per == 0:
                 interrupt.check()
                 k = step // per
-                p = x[:2] + (noise.normal(0.0, scene.tip_noise, 2) if scene.tip_noise else 0.0)
-                q = scene.angle_step * np.round(x[4:] / scene.angle_step) if scene.angle_step else x[4:]
-                sent[k] = time.perf_counter()
-                _quietly(wire.send, pack_measurement(Measurement(k, t[step], p, q)))
+                if k:
+                    data = pack_measurement(_measured(scene, k, t[step], x, noise))
+                    sent[k] = time.perf_counter()
+                    _quietly(wire.send, data)
                 bar.update()
             try:
                 x = plant.step(x, u, scene.force)
@@ -234,7 +236,27 @@ def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[A
                 ) from error
             tips[step + 1] = x[:2]
         bar.close()
-    return t, np.hypot(*(tips - wanted).T), late, round_trip, rungs, plant.dt
+    return t, np.hypot(*(tips - wanted).T), late, round_trip[1:], rungs[1:], plant.dt
+
+
+def _measured(scene: Scene, k: int, t: float, x: np.ndarray, noise: np.random.Generator) -> Measurement:
+    """What the sensors say of the plant in period k."""
+    p = x[:2] + (noise.normal(0.0, scene.tip_noise, 2) if scene.tip_noise else 0.0)
+    return Measurement(k, t, p, scene.angle_step * np.round(x[4:] / scene.angle_step) if scene.angle_step else x[4:])
+
+
+def _greeted(wire: socket.socket, first: bytes, n: int) -> np.ndarray:
+    """Rates that answer the first measurement: the reference begins with it, so the robot rests until they come."""
+    _quietly(wire.send, first)
+    end = time.perf_counter() + _GREETING
+    while time.perf_counter() < end:
+        interrupt.check()
+        select.select([wire], [], [], 0.1)
+        data = _quietly(wire.recv, command_size(n) + 1)
+        command = None if data is None else unpack_command(data, n)
+        if command is not None and command.rung != RESTING:
+            return command.u
+    raise PCRError(f"the first measurement is not answered for {_GREETING:g} s; try `pcr-mpc serve` to see why")
 
 
 def _until(due: float, wire: socket.socket, size: int) -> Iterator[tuple[bytes, float]]:

@@ -4,7 +4,9 @@ import shutil
 import socket
 import struct
 import threading
+import time
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,8 +17,9 @@ from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.errors import OutputError, PCRError
 from pcr_mpc.loop.parts.assembled import resting_state
 from pcr_mpc.loop.scene.file import load_scene
+from pcr_mpc.wire import hil
 from pcr_mpc.wire.decider import make_decider
-from pcr_mpc.wire.hil import run_hil
+from pcr_mpc.wire.hil import _plant, run_hil
 from pcr_mpc.wire.packet import (
     RESTING,
     Command,
@@ -203,11 +206,45 @@ def test_a_scene_is_tracked_through_packets(generated):
     assert server.counts == {"answered": 100}
 
 
+def test_the_clock_waits_for_the_first_command():
+    """The reference begins with the first measurement that the server sees: one that comes late must not shift it."""
+    scene = replace(load_scene(ROOT / "models" / "scenes" / "hold_slow.toml"), duration=0.05)
+    heard = []
+
+    def answer(server):
+        time.sleep(0.2)  # many periods
+        for _ in range(scene.n_periods):
+            data, sender = server.recvfrom(1000)
+            found = unpack_measurement(data, 2)
+            heard.append((found.sequence, found.time))
+            server.sendto(pack_command(Command(found.sequence, found.time, np.zeros(2), 0)), sender)
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+        server.settimeout(10.0)
+        thread = threading.Thread(target=answer, args=(server,))
+        thread.start()
+        t, _, late, round_trip, _, _ = _plant(scene, server.getsockname(), progress=False)
+        thread.join()
+    assert heard[:2] == [(0, 0.0), (1, pytest.approx(scene.period))]
+    assert (len(t), len(late), len(round_trip)) == (26, 25, 4)
+    assert np.isfinite(round_trip).any()
+
+
+def test_a_server_that_is_silent_is_told(monkeypatch):
+    monkeypatch.setattr(hil, "_GREETING", 0.05)
+    scene = replace(load_scene(ROOT / "models" / "scenes" / "hold_slow.toml"), duration=0.05)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(("127.0.0.1", 0))
+        with pytest.raises(PCRError, match=r"not answered for 0.05 s; try `pcr-mpc serve`"):
+            _plant(scene, deaf.getsockname(), progress=False)
+
+
 @pytest.mark.slow
 def test_a_loop_in_real_time_says_what_it_was():
     scene = load_scene(ROOT / "models" / "scenes" / "hold_slow.toml")
     found = run_hil(scene.tuned(scene.tuning)).summary()
-    assert found["periods"] == scene.n_periods
+    assert found["periods"] == scene.n_periods - 1
     assert found["server"]["answered"] + found["server"].get("skipped", 0) <= found["periods"]
     assert found["missed"] < found["periods"]
     assert found["max_mm"] < 20.0  # it holds, and shifts; how well depends on the machine
