@@ -21,10 +21,10 @@ from tqdm import tqdm
 from .. import interrupt
 from ..errors import PCRError, SimulationError
 from ..loop.controller.make_controller import make_controller
-from ..loop.parts.assembled import resting_state
 from ..loop.run.simulate import simulate
 from ..loop.scene.scene import Scene
-from .packet import RESTING, Measurement, command_size, pack_measurement, unpack_command
+from .hardware import Hardware
+from .packet import RESTING, command_size, pack_measurement, unpack_command
 
 _PATIENCE = 120.0  # s, until the controller's process listens
 _GREETING = 10.0  # s, until the first measurement is answered
@@ -188,61 +188,47 @@ def _controller(scene: Scene, generated: bool, pipe: Connection) -> None:
 
 
 def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[Any, ...]:
-    """Step the plant by the clock; commands act at the first step after they have come."""
-    pose, plant = scene.start(), scene.make_plant()
-    x = resting_state(pose)
-    plant.reset(x, pose)
-    per, n = round(scene.period / plant.dt), scene.robot.n_rods
-    count = scene.n_periods * per
-    t = plant.dt * np.arange(count + 1)
+    """Step the plant by the clock; commands act at the first step after they have come, or as much later as the scene
+    says."""
+    robot, n = Hardware(scene), scene.robot.n_rods
+    count, per = robot.steps, round(scene.period / robot.dt)
+    t, late = robot.dt * np.arange(count + 1), np.empty(count)
     assert scene.trajectory is not None
     wanted = scene.trajectory(t)[:, 0]
-    tips, late = np.empty((count + 1, 2)), np.empty(count)
     sent = np.full(scene.n_periods, np.nan)
     round_trip, rungs = np.full(scene.n_periods, np.nan), np.full(scene.n_periods, -1)
-    u, noise = np.zeros(n), np.random.default_rng(0)
-    tips[0] = x[:2]
-    plant.step(x, u)  # pays for building graphs before the clock runs
-    plant.reset(x, pose)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.connect(address)
         wire.setblocking(False)
-        u = _greeted(wire, pack_measurement(_measured(scene, 0, 0.0, x, noise)), n)
+        robot.told(_greeted(wire, pack_measurement(robot.measured(0)), n))
         bar = tqdm(total=scene.n_periods, desc=scene.name, unit="period", disable=not progress)
         began = time.perf_counter()
         for step in range(count):
-            due = began + step * plant.dt
+            due = began + step * robot.dt
             for data, now in _until(due, wire, command_size(n) + 1):
                 command = unpack_command(data, n)
                 if command is None or command.sequence >= len(sent):
                     continue
-                u, k = command.u, command.sequence
+                robot.told(command.u)
+                k = command.sequence
                 if command.rung != RESTING and k == (step - 1) // per:
                     round_trip[k], rungs[k] = now - sent[k], command.rung
             late[step] = time.perf_counter() - due
             if step % per == 0:
                 interrupt.check()
-                k = step // per
-                if k:
-                    data = pack_measurement(_measured(scene, k, t[step], x, noise))
+                if k := step // per:
+                    data = pack_measurement(robot.measured(k))
                     sent[k] = time.perf_counter()
                     _quietly(wire.send, data)
                 bar.update()
             try:
-                x = plant.step(x, u, scene.force)
+                robot.step()
             except PCRError as error:
                 raise SimulationError(
                     f"{scene.name}: the plant failed at {t[step]:.3f} s: {error}", t=t[step]
                 ) from error
-            tips[step + 1] = x[:2]
         bar.close()
-    return t, np.hypot(*(tips - wanted).T), late, round_trip[1:], rungs[1:], plant.dt
-
-
-def _measured(scene: Scene, k: int, t: float, x: np.ndarray, noise: np.random.Generator) -> Measurement:
-    """What the sensors say of the plant in period k."""
-    p = x[:2] + (noise.normal(0.0, scene.tip_noise, 2) if scene.tip_noise else 0.0)
-    return Measurement(k, t, p, scene.angle_step * np.round(x[4:] / scene.angle_step) if scene.angle_step else x[4:])
+    return t, np.hypot(*(robot.states[:, :2] - wanted).T), late, round_trip[1:], rungs[1:], robot.dt
 
 
 def _greeted(wire: socket.socket, first: bytes, n: int) -> np.ndarray:
@@ -282,6 +268,6 @@ def _quietly(call: Any, *arguments: Any) -> Any:
 
 def _simulated(scene: Scene, delay: float) -> float:
     """RMS error of the simulated loop with commands that come so late [m]."""
-    late = replace(scene, untold_delay=delay)
+    late = replace(scene, untold_delay=scene.untold_delay + delay)
     run = simulate(late, late.make_plant(), make_controller(late), 0, spent=lambda k, measured: 0.0)
     return 1e-3 * float(run.summary()["rms_mm"])

@@ -15,10 +15,13 @@ from hypothesis import strategies as st
 
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.errors import OutputError, PCRError
+from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.parts.assembled import resting_state
+from pcr_mpc.loop.run.simulate import simulate
 from pcr_mpc.loop.scene.file import load_scene
 from pcr_mpc.wire import hil
 from pcr_mpc.wire.decider import make_decider
+from pcr_mpc.wire.hardware import Hardware
 from pcr_mpc.wire.hil import _plant, run_hil
 from pcr_mpc.wire.packet import (
     RESTING,
@@ -238,6 +241,37 @@ def test_a_server_that_is_silent_is_told(monkeypatch):
         deaf.bind(("127.0.0.1", 0))
         with pytest.raises(PCRError, match=r"not answered for 0.05 s; try `pcr-mpc serve`"):
             _plant(scene, deaf.getsockname(), progress=False)
+
+
+def test_hardware_in_real_time_is_late_as_in_a_simulation():
+    """The same commands, one a period, lead to the same states, and the same is measured."""
+    scene = replace(
+        load_scene(ROOT / "models" / "scenes" / "servo.toml"),
+        duration=0.12,
+        motors=Motors(time_constant=0.02, backlash=0.01),
+        wrapped=True,
+        untold_delay=0.0037,
+        delay=2,
+    )
+    told = 0.5 * np.sin(np.arange(scene.n_periods)[:, None] + np.arange(2))
+
+    class Given:
+        def start(self, pose):
+            pass
+
+        def step(self, k, x):
+            return told[k]
+
+    run = simulate(scene, scene.make_plant(), Given(), 0)
+    robot = Hardware(scene)
+    for k, u in enumerate(told):
+        found = robot.measured(k)
+        np.testing.assert_array_equal([*found.p, *found.q], run.measured[k][[0, 1, 4, 5]])
+        robot.told(u)
+        for _ in range(10):
+            robot.step()
+    np.testing.assert_array_equal(robot.states, run.x)
+    assert np.abs(run.x[-1, 4:] - run.x[0, 4:]).max() > 1e-3  # it has moved
 
 
 @pytest.mark.slow
