@@ -63,8 +63,8 @@ def condensing(
     -------
     casadi.Function
         (models (size, 1 or N), x (4 + n), states (4 + n, N), inputs (n, N), u_previous (n), weights (4), T,
-        bounds (n, 4), dt) -> P as `QuadraticProgram` holds it, q, l, u, and [|P|, |q|, 1 if all is finite and no
-        bounds cross, else 0].
+        bounds (n, 4), dt) -> P as `QuadraticProgram` holds it, q, l, u, the optimum without limits, and [|P|, |q|, 1 if
+        all is finite and no bounds cross, else 0].
     """
     n_states = 4 + n
     packed = ca.MX.sym("models", n_states * (n_states + 1 + n + 2), models)
@@ -117,15 +117,39 @@ def condensing(
         ca.repmat((upper - x[4:]) / dt, horizon, 1),
     ]
     p, q, l, u = (ca.vertcat(*parts) for parts in (triangle, gradient, l_all, u_all))  # noqa: E741
+    free_inputs = without_limits(p, q, unrolled=horizon <= _UNROLLED)
     sizes = ca.norm_2(p), ca.norm_2(q)
     # So written that NaN is not sound.
     sound = ca.logic_and(ca.mmin(u - l) >= 0, ca.norm_inf(ca.vertcat(l, u)) < _LARGEST)
     for size in sizes:
         sound = ca.logic_and(sound, size < _LARGEST)
-    results = [p, q, l, u, ca.vertcat(*sizes, sound)]
+    results = [p, q, l, u, free_inputs, ca.vertcat(*sizes, sound)]
     arguments = [packed, x, states, inputs, previous, weights, terminal, bounds, dt]
     graph = ca.Function("condense", arguments, [ca.densify(result) for result in results])
     return graph.expand("condense", {"cse": True}) if inline and horizon <= _UNROLLED else graph
+
+
+def without_limits(triangle: Any, q: Any, *, unrolled: bool) -> Any:
+    """Expression of the U that minimises 1/2 U'PU + q'U.
+
+    By Cholesky, column after column, where it is to be ``unrolled``: then half of each symmetric rest falls away, as it
+    is not used, and U is NaN where P is not positive definite. By CasADi's LDL' else.
+    """
+    size = q.numel()
+    rest, right = ca.triu2symm(ca.MX(ca.Sparsity.upper(size), triangle)), -q
+    if not unrolled:
+        return ca.solve(rest, right, "ldl", {"preordering": False})
+    factor = []
+    for _ in range(size - 1):
+        column = rest[:, 0] / ca.sqrt(rest[0, 0])
+        diagonal, below = column[0], column[1:]
+        head = right[0] / diagonal
+        factor.append((diagonal, below, head))
+        rest, right = rest[1:, 1:] - below @ below.T, right[1:] - below * head
+    found = right / ca.sqrt(rest) / ca.sqrt(rest)  # NaN, as all others, of what is negative
+    for diagonal, below, head in reversed(factor):
+        found = ca.vertcat((head - below.T @ found) / diagonal, found)
+    return found
 
 
 @graph_cache(maxsize=32)

@@ -36,7 +36,7 @@ class Plan(Frozen):
     slack : dict
         By how much limits had to give, by kind, in their own units ([rad], [N m], [m], 1, [N/m]); only those that did.
     iterations : int
-        Of the solver.
+        Of the solver; 1 where no limit acts, and none was asked.
     primal_residual, dual_residual : float
         Recomputed from the problem's data; NaN if unsolved.
     update_time, solve_time, solver_time : float

@@ -53,6 +53,8 @@ class QuadraticProgram:
         Bounds.
     sizes : ndarray, shape (3,), optional
         ``|P|``, ``|q|``, and 1 if all entries are finite and no bounds cross, as the graph that made them has found.
+    free : ndarray, shape (Nn,), optional
+        The optimum without limits; NaN where it is not known.
     block : ndarray, optional
         Linear models, state, P, q, l and u one after the other, where they are parts of one memory.
     """
@@ -63,6 +65,7 @@ class QuadraticProgram:
     l: np.ndarray  # noqa: E741  OSQP's name
     u: np.ndarray
     sizes: np.ndarray = field(default_factory=lambda: np.array([np.nan, np.nan, 0.0]))
+    free: np.ndarray | None = None
     block: np.ndarray | None = None
 
     @property
@@ -133,8 +136,8 @@ def assemble(
     bounds[:] = motor_bounds(limits)
     dt[0] = models.dt
     function()
-    p, q, lower, upper, sizes = (output.copy() for output in function.outputs)
-    return QuadraticProgram(p, q, constraint_matrix(tuning.horizon, n), lower, upper, sizes)
+    p, q, lower, upper, free, sizes = (output.copy() for output in function.outputs)
+    return QuadraticProgram(p, q, constraint_matrix(tuning.horizon, n), lower, upper, sizes, free)
 
 
 @per_thread(maxsize=32)

@@ -108,6 +108,7 @@ class CheckedQP(ABC):
         y: np.ndarray,
         *,
         sound: bool,
+        afresh: bool = False,
     ) -> tuple[int, float]:
         """Update, start warm and solve in one go.
 
@@ -118,7 +119,9 @@ class CheckedQP(ABC):
         sound : bool
             The graph that made the problem has checked it, and it stays as it is until the next one.
         start : ndarray, shape (n,), or None
-            From a solution; the multipliers are the last ones.
+            From a solution; the multipliers are the last ones, or zero.
+        afresh : bool
+            They are zero.
         x, y : ndarray, shapes (n,) and (m,)
             The solution is written there. Its residuals are left to the caller, who lets `judge` see them.
 
@@ -139,7 +142,7 @@ class CheckedQP(ABC):
         else:
             self.update(*problem)
         if start is not None:
-            self._start_from(start, None)
+            self._start_from(start, np.zeros(self.m) if afresh else None)
         return self._solve_into(x, y, self._most)
 
     @abstractmethod

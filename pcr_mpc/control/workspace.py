@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import time
+
 import numpy as np
 
 from ..buffered import BufferedFunction
@@ -41,6 +44,7 @@ class Workspace:
         self._rates_only = solver(rates, tuning.tolerance, tuning.max_iterations)
         self._limited: dict[tuple[str, ...], LimitedQP] = {}
         self._limits_matter = False  # in the last plan, beside those on the rates
+        self._unlimited = False  # no limit has shaped the last plan
         self._spent, self._inside = 0, 0.0  # iterations and seconds of the solver in this control step
         self.check = Check(tuning.horizon, self.n, compiled=tuning.model.compiled)
 
@@ -52,7 +56,7 @@ class Workspace:
 
     def reset(self) -> None:
         """Start afresh."""
-        self._limits_matter = False
+        self._limits_matter = self._unlimited = False
         self._rates_only.reset()
         for solver in self._limited.values():
             solver.reset()
@@ -77,18 +81,22 @@ class Workspace:
         """Solve with the rates' rows alone; where that breaks another limit, or fails, with all of them.
 
         An optimum of the smaller problem that keeps the left-out rows is the optimum of the whole, and costs half;
-        its multipliers are those of the rates' rows, the others being zero. While other limits shape the plans, the
-        whole is solved at once.
+        its multipliers are those of the rates' rows, the others being zero. First of all comes the optimum without
+        limits, of which the same is true and which takes no solver. While other limits than those on the rates shape
+        the plans, the whole is solved at once.
         """
         self._spent, self._inside = 0, 0.0
         if not self._limits_matter:
             check, rate, solver = self.check.loaded(qp, x, models, limits), self._rate, self._rates_only
+            if qp.free is not None and qp.sound and (found := self._without_limits(check, qp, pose_limits)):
+                return found
             at, y, problem, start = check.rates, check.y, check.problem, warm
             if rate != 1.0:
                 at, y, problem = np.empty_like(at), np.empty_like(y), check.scaled(rate)
                 start = None if warm is None else warm / rate
             try:
-                spent, inside = solver.answer(problem, start, at, y, sound=qp.sound)
+                spent, inside = solver.answer(problem, start, at, y, sound=qp.sound, afresh=self._unlimited)
+                self._unlimited = False
                 if rate != 1.0:
                     check.rates[:], check.y[:] = rate * at, y / rate
                 else:
@@ -103,18 +111,33 @@ class Workspace:
                 if rate != 1.0:
                     inputs = check.rates.copy()
                     solution = solution._replace(x=inputs, y=check.y.copy())
-                if pose_limits is not None:
-                    rows = states[1:] @ pose_limits.C.T
-                    broken = max(
-                        broken, float((pose_limits.lower - rows).max()), float((rows - pose_limits.upper).max())
-                    )
-                if broken <= self._tuning.tolerance * rate * self.dt:
+                if _broken(broken, states, pose_limits) <= self._tuning.tolerance * rate * self.dt:
                     active: tuple[str, ...] = ()
                     if of_rates or of_changes:
                         active = active_of({_RATES[0]: rate * of_rates, _RATES[1]: rate * of_changes})
                     return Limited(inputs, states, kept > 0.0, {}, active, solution)
                 self._spent, self._inside, warm = spent, inside, inputs
         return self._solve_whole(qp, x, models, pose_limits, warm, soft_angles=False)
+
+    def _without_limits(self, check: Loaded, qp: QuadraticProgram, pose_limits: LinearLimits | None) -> Limited | None:
+        """The optimum without limits, if it keeps them all, to the last bit."""
+        assert qp.free is not None
+        inputs, y, began = check.rates, check.y, time.perf_counter()
+        inputs[:], y[:] = qp.free, 0.0
+        primal, dual, broken, _, _, kept = check()
+        spent = time.perf_counter() - began
+        # As accurate as a solver's answer must be, for |q| is at most that much greater than its largest entry. What
+        # is NaN is not kept.
+        tolerance = self._tuning.tolerance * (time_unit(self.dt) + float(qp.sizes[1]) / math.sqrt(len(inputs)))
+        if kept <= 0.0 or primal > 0.0 or broken > 0.0 or not dual <= tolerance:
+            return None
+        states = check.states()
+        if _broken(broken, states, pose_limits) > 0.0:
+            return None
+        self._unlimited = True
+        # One iteration, as an active-set method counts it.
+        solution = Solution(inputs.copy(), y.copy(), 1, spent, primal, self._rate * dual)
+        return Limited(solution.x, states, True, {}, (), solution)
 
     def soften(
         self, qp: QuadraticProgram, x: np.ndarray, models: LinearModels, pose_limits: LinearLimits | None
@@ -154,6 +177,14 @@ class Workspace:
     def _count(self, error: InfeasibleError) -> None:
         self._spent += error.details.get("iterations", 0)
         self._inside += error.details.get("run_time", 0.0)
+
+
+def _broken(angles: float, states: np.ndarray, limits: LinearLimits | None) -> float:
+    """By how much states exceed the limits of a pose, or ``angles`` those of the motors."""
+    if limits is None:
+        return angles
+    rows = states[1:] @ limits.C.T
+    return max(angles, float((limits.lower - rows).max()), float((rows - limits.upper).max()))
 
 
 class Check:

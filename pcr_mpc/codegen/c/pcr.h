@@ -105,7 +105,7 @@ typedef struct {
     double u[PCR_N];                            /* rates for the motors [rad/s] */
     pcr_rung rung;
     pcr_qp_status solver;
-    int iterations;                             /* of the solver, in all */
+    int iterations;                             /* of the solver, in all; 1: no limit acts */
     double primal_residual, dual_residual;      /* recomputed from the data of the QP; NaN if it was not solved */
     int active;                                 /* limits that shape the plan, PCR_LIMIT_... */
     double slack[8];                            /* by how much each kind of limit has to give, by its bit */
@@ -147,7 +147,7 @@ typedef struct {
     double watch_record[PCR_WATCH_RECORD], watch_result[6 + 2 * PCR_N];
     int has_plan, has_states, has_models, age;              /* of the last plan; age in periods, -1 beyond all */
     double inputs[PCR_HORIZON][PCR_N], states[PCR_HORIZON + 1][PCR_STATES], models[PCR_MODELS * PCR_MODEL];
-    int has_problem, limits_matter;
+    int has_problem, limits_matter, unlimited;
     double hessian, gradient;                               /* sizes of the last problem */
     pcr_qp rates;
     double rates_doubles[PCR_RATES_DOUBLES];

@@ -30,7 +30,7 @@ void pcr_law_restore(pcr_controller *c, const pcr_controller *saved)
 
 static void reset_solvers(pcr_controller *c)
 {
-    c->limits_matter = 0;
+    c->limits_matter = c->unlimited = 0;
     reset_rates(c);
     pcr_limited_reset(&c->limited, PCR_PENALTY * c->parameters.weights[0] * c->parameters.reach * c->parameters.reach);
 }
@@ -95,6 +95,48 @@ static int active_of(const double *pulls, const int *bits, int count)
     return active;
 }
 
+/* By how much the predicted states exceed the limits of poses, or `angles` those of the motors. */
+static double broken_by(const pcr_controller *c, const pcr_pose_limits *limits, double angles)
+{
+    double broken = angles;
+    for (int k = 1; k <= PCR_HORIZON; k++) {
+        for (int i = 0; i < limits->count; i++) {
+            double value = 0.0;
+            for (int j = 0; j < PCR_STATES; j++) {
+                value += limits->c[i][j] * c->check_out[k * PCR_STATES + j];
+            }
+            broken = fmax(broken, fmax(limits->lower[i] - value, value - limits->upper[i]));
+        }
+    }
+    return broken;
+}
+
+/* The optimum without limits, if it keeps them all. Returns 1 if that is the answer. */
+static int solve_without_limits(pcr_controller *c, const pcr_pose_limits *limits, double *inputs, pcr_output *output)
+{
+    const double *found = c->check_out + (PCR_HORIZON + 1) * PCR_STATES, *decisions = c->out + PCR_OUT_DECISIONS;
+    const double tolerance = PCR_TOLERANCE * (UNIT + decisions[3] / sqrt((double)PCR_INPUTS));
+    if (!(decisions[4] > 0.0)) {
+        return 0;
+    }
+    memcpy(c->check_in + PCR_CHECK_INPUTS, c->out + PCR_OUT_FREE, PCR_INPUTS * sizeof *found);
+    memset(c->check_in + PCR_CHECK_Y, 0, 2 * PCR_INPUTS * sizeof *found);
+    check(c);
+    if (!(found[5] > 0.0) || found[0] > 0.0 || found[2] > 0.0 || !(found[1] <= tolerance)
+        || broken_by(c, limits, found[2]) > 0.0) {
+        return 0;
+    }
+    memcpy(inputs, c->out + PCR_OUT_FREE, PCR_INPUTS * sizeof *inputs);
+    memcpy(c->states, c->check_out, sizeof c->states);
+    output->active = 0;
+    output->primal_residual = found[0];
+    output->dual_residual = 1.0 / UNIT * found[1];
+    output->iterations = 1; /* as an active-set method counts it */
+    output->solver = PCR_QP_SOLVED;
+    c->unlimited = 1;
+    return 1;
+}
+
 /* Solve with the rows of the rates alone. Returns 1 if that is the answer. */
 static int solve_rates(pcr_controller *c, const pcr_pose_limits *limits, const double *warm, int *spent,
                        double *inputs, int *kept, pcr_output *output)
@@ -145,10 +187,11 @@ static int solve_rates(pcr_controller *c, const pcr_pose_limits *limits, const d
         return 0;
     }
     if (warm != NULL) {
+        static const double none[2 * PCR_INPUTS]; /* multipliers */
         for (int i = 0; i < PCR_INPUTS; i++) {
             start[i] = warm[i] / rate;
         }
-        pcr_qp_warm_start(&c->rates, start, NULL);
+        pcr_qp_warm_start(&c->rates, start, c->unlimited ? none : NULL);
     }
     int iterations;
     left = pcr_qp_solve(&c->rates, PCR_MAX_ITERATIONS, &iterations);
@@ -157,6 +200,7 @@ static int solve_rates(pcr_controller *c, const pcr_pose_limits *limits, const d
         output->solver = (pcr_qp_status)left;
         return 0;
     }
+    c->unlimited = 0;
     for (int i = 0; i < PCR_INPUTS; i++) {
         in[PCR_CHECK_INPUTS + i] = inputs[i] = rate * c->rates.solution.x[i];
     }
@@ -170,17 +214,7 @@ static int solve_rates(pcr_controller *c, const pcr_pose_limits *limits, const d
         output->solver = (pcr_qp_status)left;
         return 0;
     }
-    double broken = found[2];
-    for (int k = 1; k <= PCR_HORIZON; k++) {
-        for (int i = 0; i < limits->count; i++) {
-            double value = 0.0;
-            for (int j = 0; j < PCR_STATES; j++) {
-                value += limits->c[i][j] * c->check_out[k * PCR_STATES + j];
-            }
-            broken = fmax(broken, fmax(limits->lower[i] - value, value - limits->upper[i]));
-        }
-    }
-    if (!(broken <= PCR_TOLERANCE * rate * PCR_PERIOD)) {
+    if (!(broken_by(c, limits, found[2]) <= PCR_TOLERANCE * rate * PCR_PERIOD)) {
         return 0;
     }
     const double pulls[2] = {rate * found[3], rate * found[4]};
@@ -258,7 +292,8 @@ void pcr_decide(pcr_controller *c, const pcr_pose_limits *limits, pcr_output *ou
 
     output->rung = PCR_SOLVED;
     if (!c->limits_matter) {
-        solved = solve_rates(c, limits, warm, &spent, inputs, &kept, output);
+        kept = solved = solve_without_limits(c, limits, inputs, output);
+        solved = solved || solve_rates(c, limits, warm, &spent, inputs, &kept, output);
         if (!solved && spent && output->solver == PCR_QP_SOLVED) {
             memcpy(shifted, inputs, sizeof shifted);
             warm = shifted;

@@ -157,7 +157,7 @@ class Foresight:
         if condense is not None:
             qp = QuadraticProgram(
                 found["P"], found["q"], constraint_matrix(places.horizon, n), found["l"], found["u"],
-                self._decisions[2:], graph.memory_out[ends["now"] : ends["u"]],
+                self._decisions[2:], found["free"], graph.memory_out[ends["now"] : ends["u"]],
             )  # fmt: skip
         self.outlook = Outlook(
             ahead=found["ahead"],

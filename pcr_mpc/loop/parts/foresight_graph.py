@@ -158,7 +158,7 @@ def foresight_graph(
         behind = _behind(n, of_plan[:, 0].sparsity())
         of_plan = ca.horzcat(*(behind(of_plan[:, j], due[:, j], changes[:, j]) for j in range(places.models)))
     of_plan = ca.densify(of_plan)  # once, for the QP and for the result
-    qp: Any = [ca.MX(0, 1)] * 4
+    qp: Any = [ca.MX(0, 1)] * 5
     measures = ca.MX.zeros(3)
     if condense is not None:
         *qp, measures = condense(of_plan, ahead, states, given.inputs + changes, given.u_previous, given.weights,
@@ -171,7 +171,7 @@ def foresight_graph(
         "followed": records, "stays": records[:, -1], "followed_target": target_record, "moved_shift": shift,
         "moved_reckoned": reckoned, "moved_lead": ahead[4:] - reckoned, "next_moves": moves, "next_lags": lags,
         "now": models[:, : places.delay], "models": of_plan, "ahead": ahead, "P": qp[0], "q": qp[1], "l": qp[2],
-        "u": qp[3],
+        "u": qp[3], "free": qp[4],
     }  # fmt: skip
     return ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
 
