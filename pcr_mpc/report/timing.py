@@ -104,7 +104,7 @@ def _table_of_c(result: dict[str, Any]) -> str:
         worst = row["worst"]
         text = f"longest control step in C with {row['solver']}, by its count: {worst['iterations']} iterations"
         if worst["us"] is None:
-            text += f" of {worst['flops']:.2g} operations; all steps took as many iterations, so no time is told"
+            text += f" of {worst['flops']:.2g} operations; what one takes was not measured"
         else:
             text += (f" x {worst['iteration_us']:.3g} us (all soft rows, {worst['flops']:.2g} operations) + "
                      f"{worst['rest_us']:.3g} us = {worst['us']:.3g} us")  # fmt: skip
