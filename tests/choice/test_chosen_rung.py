@@ -35,7 +35,7 @@ def original(tmp_path_factory):
     shutil.copytree(CONTROLLERS, folder / "controllers")
     path = folder / "models/scenes/release.toml"
     text = path.read_text()
-    for old, new in (("duration = 1.0", "duration = 0.4"), ("plant_step = 1000.0", "plant_step = 1e6")):
+    for old, new in (("duration = 1.0", "duration = 0.2"), ("plant_step = 1000.0", "plant_step = 1e6")):
         assert old in text
         text = text.replace(old, new)
     path.write_text(text)
