@@ -31,7 +31,7 @@ from ..report.plots import animate_run, plot_run
 from ..report.tables import summary_table
 from ..study.margins.predicted import predict_delay_margin
 from ..view.replay import write_replay
-from .parser import LINKS
+from .options.command import LINKS
 
 _MARGIN_POSES = 5  # a quarter of a second
 _PICTURES, _LEARNT = ("track.png", "track.gif", "replay.html"), ("laps.png",)

@@ -13,9 +13,9 @@ import pytest
 
 from pcr_mpc import HoldMotors, load_scene, load_tuning, simulate
 from pcr_mpc.cli import main
-from pcr_mpc.cli.parser import METHODS
 from pcr_mpc.errors import OutputError
 from pcr_mpc.files import ours, replacing, require_free, results, stamped, write_text
+from pcr_mpc.methods import METHODS
 from pcr_mpc.plant.statics import held_tip as statics
 from pcr_mpc.study.choice.file import _renewed
 from pcr_mpc.study.tuning.file import write_tuning
