@@ -26,7 +26,7 @@ from ..loop.scene.scene import Scene
 from .hardware import Hardware
 from .packet import RESTING, command_size, pack_measurement, unpack_command
 
-_PATIENCE = 120.0  # s, until the controller's process listens
+_PATIENCE = 120.0  # s, until the controller's process has ended
 _GREETING = 10.0  # s, until the first measurement is answered
 _SILENCE, _SILENCE_TIME = 5, 0.25  # periods at least, and s
 _SPIN = 1e-4  # s before a step is due, in which sleeping is too coarse
@@ -123,11 +123,12 @@ def run_hil(scene: Scene, *, generated: bool = False, progress: bool = False) ->
     process = context.Process(target=_controller, args=(scene, generated, theirs), daemon=True)
     process.start()
     try:
-        address = _expected(ours, process)
+        # As long as it takes: C of a long scene is generated and compiled.
+        address = _expected(ours, process, math.inf)
         with _preferred() as priority:
             plant_log = _plant(scene, address, progress=progress)
         ours.send("end")
-        counts = _expected(ours, process)
+        counts = _expected(ours, process, _PATIENCE)
     finally:
         if process.is_alive():
             process.join(2.0)
@@ -155,8 +156,9 @@ def _preferred() -> Iterator[str]:
         os.sched_setscheduler(0, before, os.sched_param(0))
 
 
-def _expected(pipe: Connection, process: Any) -> Any:
-    for _ in range(int(_PATIENCE / 0.1)):
+def _expected(pipe: Connection, process: Any, patience: float) -> Any:
+    end = time.monotonic() + patience
+    while time.monotonic() < end:
         if pipe.poll(0.1):
             found = pipe.recv()
             if isinstance(found, BaseException):

@@ -1,5 +1,6 @@
 """Packets, and the server that answers them: what is none moves no motor, and silence brings them to rest."""
 
+import math
 import shutil
 import socket
 import struct
@@ -7,6 +8,7 @@ import threading
 import time
 import zlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -232,6 +234,24 @@ def test_the_clock_waits_for_the_first_command():
     assert heard[:2] == [(0, 0.0), (1, pytest.approx(scene.period))]
     assert (len(t), len(late), len(round_trip)) == (26, 25, 4)
     assert np.isfinite(round_trip).any()
+
+
+def test_a_controller_may_take_long_to_get_ready():
+    """C of a minute at 1 kHz takes minutes; a process that has ended does not."""
+
+    class Pipe:
+        asked = 0
+
+        def poll(self, wait):
+            self.asked += 1
+            return self.asked > 5000
+
+        def recv(self):
+            return "ready"
+
+    assert hil._expected(Pipe(), SimpleNamespace(is_alive=lambda: True), math.inf) == "ready"
+    with pytest.raises(PCRError, match="has ended"):
+        hil._expected(Pipe(), SimpleNamespace(is_alive=lambda: False), math.inf)
 
 
 def test_a_server_that_is_silent_is_told(monkeypatch):
