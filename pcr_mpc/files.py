@@ -15,12 +15,13 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from .errors import OutputError
 
+_MADE: list[Path] = []  # folders, by the command that runs
 _LIST = ".pcr-mpc.json"
 _STAMP = "written by pcr-mpc"
 _LONGEST_NAME = 100
@@ -88,8 +89,10 @@ def require_free(path: Path, *, force: bool = False) -> None:
         Names the file or the folder, and what to do.
     """
     path = path.resolve()
+    missing = [folder for folder in path.parents if not folder.exists()]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _MADE.extend(missing)
     except (FileExistsError, NotADirectoryError):
         file = next(place for place in (path.parent, *path.parents) if place.is_file())
         raise OutputError(f"{file}: a file is where a folder is wanted; give another name", path=str(file)) from None
@@ -108,6 +111,19 @@ def require_free(path: Path, *, force: bool = False) -> None:
             )
     except OSError as error:
         raise OutputError(f"{path.parent}: cannot be written to: {error.strerror}", path=str(path.parent)) from None
+
+
+@contextmanager
+def leaving_no_empty_folders() -> Iterator[None]:
+    """Remove the folders that `require_free` makes in here if what is done fails before anything is in them."""
+    _MADE.clear()
+    try:
+        yield
+    except BaseException:
+        for folder in sorted(_MADE, key=lambda folder: -len(folder.parts)):
+            with suppress(OSError):  # it has files, or is gone
+                folder.rmdir()
+        raise
 
 
 def require_folder(folder: Path, names: Iterable[str], *, force: bool = False) -> None:

@@ -11,6 +11,7 @@ import warnings
 from pathlib import Path
 
 from .. import interrupt
+from ..files import leaving_no_empty_folders
 from .parser import LEAST, parser
 
 # Arguments that name a file: a path, or the name of one of these kinds that comes with the package.
@@ -44,7 +45,8 @@ def _run(options: argparse.Namespace) -> int:
         with interrupt.nothing_to_lose():
             module, name = options.run
             command = getattr(importlib.import_module(f"{__package__}.{module}"), name)
-        status: int = command(options)
+        with leaving_no_empty_folders():
+            status: int = command(options)
         sys.stdout.flush()
         interrupt.check()
         return status

@@ -9,7 +9,7 @@ from .tables import table
 _LIGHT = 0.01  # share of the rods in the mass that moves, below which nobody is told
 _LEFT_OUT = (
     "rods        {:.0f} % of the mass that moves, left out of the plan: lower [limits] of the scene leave room;\n"
-    '            track the plan with inertia = "condensed" in the scene\'s [plant] to see how much it takes'
+    '            with inertia = "condensed" in the model of the scene\'s tuning the plan reckons with them'
 )
 
 
@@ -33,7 +33,7 @@ def plan_table(summary: dict[str, Any]) -> str:
         f"duration    {summary['duration_s']:.4f} s, rest to rest",
         f"path        {summary['length_mm']:.1f} mm, within {summary['deviation_mm']:.3g} mm of the reference's",
         f"top speed   {summary['top_speed_m_s']:.3g} m/s",
-        *([_LEFT_OUT.format(100 * rods)] if rods > _LIGHT else []),
+        *_rods_lines(summary.get("rods"), rods),
         "",
         table(("limit", "value", "unit", "most used [%]", "at [s]", "acts [% of time]"), rows),
         "",
@@ -43,3 +43,16 @@ def plan_table(summary: dict[str, Any]) -> str:
     if "planning_s" in summary:
         lines[-1] += f" in {summary['planning_s']:.2f} s"
     return "\n".join(lines)
+
+
+def _rods_lines(rods: dict[str, Any] | None, share: float) -> list[str]:
+    if rods is None:
+        return [_LEFT_OUT.format(100 * share)] if share > _LIGHT else []
+    parts = [
+        f"{rods['asked'][name]:.4g} of {rods['limits'][name]:.4g} {unit}"
+        for name, unit in (("rate_rad_s", "rad/s"), ("rate_change_rad_s2", "rad/s^2"), ("torque_Nm", "N m"))
+    ]
+    return [
+        f"rods        {100 * share:.0f} % of the mass that moves ({rods['inertia']}); with it the motors are asked for",
+        f"            {', '.join(parts)} at the control periods; the limits below are lowered for that",
+    ]

@@ -14,7 +14,7 @@ import pytest
 from pcr_mpc import HoldMotors, load_scene, load_tuning, simulate
 from pcr_mpc.cli import main
 from pcr_mpc.errors import OutputError
-from pcr_mpc.files import ours, replacing, require_free, results, stamped, write_text
+from pcr_mpc.files import leaving_no_empty_folders, ours, replacing, require_free, results, stamped, write_text
 from pcr_mpc.methods import METHODS
 from pcr_mpc.plant.statics import held_tip as statics
 from pcr_mpc.study.choice.file import _renewed
@@ -267,3 +267,14 @@ def test_comments_by_hand_outlive_a_new_rung():
 def test_the_command_line_knows_the_methods():
     """Which it names itself, so that its help is there before two seconds of loading."""
     assert METHODS == statics.METHODS
+
+
+def test_what_fails_leaves_no_empty_folder(tmp_path):
+    """But what is in a folder, or was there before, stays."""
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(OutputError), leaving_no_empty_folders():
+        for path in ("mine/a.csv", "new/deep/a.csv", "kept/a.csv"):
+            require_free(tmp_path / path)
+        (tmp_path / "kept" / "a.csv").write_text("1")
+        raise OutputError("no", path="no")
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == ["kept", "kept/a.csv", "mine"]

@@ -17,6 +17,7 @@ from pcr_mpc import (
     Spline,
     UnreachableError,
     UnstableError,
+    check_scene,
     inverse_statics,
     load_path,
     load_scene,
@@ -313,6 +314,33 @@ def test_a_free_path_keeps_every_limit(scene, limit, value):
         assert speed.max() == pytest.approx(value, rel=2e-3)
     share = dict(zip(free.kinds, free.shares.max(axis=1), strict=True))
     assert share["motor torque" if limit == "torque" else limit.replace("_", " ")] > 0.98
+
+
+@pytest.mark.slow
+def test_a_plan_reckons_with_the_rods_inertia_that_the_controller_knows(scene):
+    """Of rods three times as heavy: where a plan without it asks for too much, one with it does not, and is slower."""
+    rods = tuple(replace(rod, line_density=3.0 * rod.line_density) for rod in scene.robot.rods)
+    model = replace(scene.tuning.model, inertia="condensed")
+    heavy = replace(scene, robot=replace(scene.robot, rods=rods), tuning=replace(scene.tuning, model=model))
+
+    def tracked(planned):
+        duration = heavy.period * (math.ceil(planned.duration / heavy.period) + 20)
+        return replace(heavy, trajectory=planned, duration=duration)
+
+    light = plan_timing(replace(heavy, tuning=scene.tuning), cells=40)
+    assert light.rods is None
+    assert any("change its rate by" in line for line in check_scene(tracked(light)))
+    planned = plan_timing(heavy, cells=40)
+    assert check_scene(tracked(planned)) == []
+    assert light.duration < planned.duration < 1.3 * light.duration
+    assert planned.rods.acceleration == pytest.approx(heavy.robot.acceleration_limit, rel=2e-2)
+    assert planned.limits.acceleration < heavy.robot.acceleration_limit
+    assert "lowered for that" in plan_table(planned.summary() | {"share_of_rods": 0.1})
+    # A plant whose rods have that mass, led by a controller that knows it.
+    there = replace(tracked(planned), plant=replace(heavy.plant, inertia="condensed"))
+    run = simulate(there, there.make_plant(), make_controller(there))
+    assert not run.summary()["limit_violations"]
+    assert run.summary()["max_mm"] < 0.5
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from .meshing import FINE, points, repaced, with_points
 from .motion import Carrier
 from .pace import cells_of, spline_of, times
 from .path import TipPath, path_of
+from .rods_mass import with_rods
 from .starting import STATICS, evened, started, where
 from .timed_path import Paced, TimedPath
 from .timing import Problem, Timing
@@ -78,8 +79,10 @@ def plan_timing(
 
     Notes
     -----
-    The rods are without mass, as in the paper. A force on the tip that the scene has and its controller does not know
-    is not planned for. With more motors than two the angles are those of least motion.
+    Where the scene's controller knows an inertia of the rods (``inertia`` in its tuning's model), limits are lowered
+    until the motors keep the given ones with it (see `with_rods`); else the rods are without mass, as in the paper. A
+    force on the tip that the scene has and its controller does not know is not planned for. With more motors than two
+    the angles are those of least motion.
 
     References
     ----------
@@ -96,26 +99,46 @@ def plan_timing(
     own = getattr(scene.trajectory, "duration", math.inf)
     span = own if math.isfinite(own) else scene.duration
     path = path_of(scene.trajectory, span, tolerance)
-    iterations = 0
+    carrier = carrier_of(scene, span)
     with tqdm(disable=not progress, unit=" iterations", desc="planning", leave=False) as bar:
 
         def told(seconds: float) -> None:
-            nonlocal iterations
-            iterations += 1
             bar.set_postfix_str(f"{seconds:.4f} s")
             bar.update()
 
-        _require_region(scene, limits, path)
-        problem = Problem(paced(path), scene.start(), carrier_of(scene, span), limits)
-        timing = faster(evened(started(problem, path)), most=_ITERATIONS[0], tolerance=_GAINS[0], told=told)
-        wanted = cells or int(np.clip(math.ceil(timing.duration / _CELL), _FEWEST, _MOST))
-        timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
-        timing = faster(timing, most=_ITERATIONS[1], trust=0.3, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
-        if free:
-            found = freed(timing, points_between, wanted, _ALLOWED)
-            return _free_result(scene.name, found, path, limits, iterations + found.iterations)
-        timing, fine = refined(timing, told)
-    return _result(scene.name, timing, fine, path.deviation, iterations)
+        def planned_for(kept: PlanLimits) -> TimedPath:
+            _require_region(scene, kept, path)
+            problem = Problem(paced(path), scene.start(), carrier, kept)
+            return _planned(scene.name, problem, path, cells, points_between if free else None, told)
+
+        return with_rods(scene, limits, carrier.mass - scene.robot.tip_mass, planned_for)
+
+
+def _planned(
+    name: str,
+    problem: Problem,
+    path: TipPath,
+    cells: int | None,
+    points_between: np.ndarray | None,
+    told: Callable[[float], None],
+) -> TimedPath:
+    """For rods without mass; between way-points freely, if they are given."""
+    iterations = 0
+
+    def counted(seconds: float) -> None:
+        nonlocal iterations
+        iterations += 1
+        told(seconds)
+
+    timing = faster(evened(started(problem, path)), most=_ITERATIONS[0], tolerance=_GAINS[0], told=counted)
+    wanted = cells or int(np.clip(math.ceil(timing.duration / _CELL), _FEWEST, _MOST))
+    timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
+    timing = faster(timing, most=_ITERATIONS[1], trust=0.3, allowed=_ALLOWED, tolerance=_GAINS[1], told=counted)
+    if points_between is not None:
+        found = freed(timing, points_between, wanted, _ALLOWED)
+        return _free_result(name, found, path, problem.limits, iterations + found.iterations)
+    timing, fine = refined(timing, counted)
+    return _result(name, timing, fine, path.deviation, iterations)
 
 
 def carrier_of(scene: Scene, span: float) -> Carrier:

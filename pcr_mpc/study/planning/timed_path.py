@@ -74,6 +74,43 @@ class Paced(Move):
         return times(self.pace, np.linspace(0.0, 1.0, cells_of(self.pace) + 1))
 
 
+@dataclass(frozen=True)
+class RodsMass:
+    """What a plan asks of the motors with the rods' inertia, at the control periods.
+
+    Attributes
+    ----------
+    inertia : str
+        Of the rods, as the scene's controller knows it.
+    limits : PlanLimits
+        That are kept with it.
+    rate, acceleration, torque : float
+        Largest of any motor [rad/s], [rad/s^2], [N m].
+    rounds : int
+        Plans that were made.
+    """
+
+    inertia: str
+    limits: PlanLimits
+    rate: float
+    acceleration: float
+    torque: float
+    rounds: int
+
+    def summary(self) -> dict[str, Any]:
+        """Ready for JSON: what is asked of the motors with inertia, and what is allowed."""
+        return {
+            "inertia": self.inertia,
+            "plans": self.rounds,
+            "asked": {"rate_rad_s": self.rate, "rate_change_rad_s2": self.acceleration, "torque_Nm": self.torque},
+            "limits": {
+                "rate_rad_s": self.limits.rate,
+                "rate_change_rad_s2": self.limits.acceleration,
+                "torque_Nm": self.limits.torque,
+            },
+        }
+
+
 @dataclass(frozen=True, eq=False)
 class TimedPath(Frozen):
     """A path with its timing, at rest before and after; a `Trajectory`.
@@ -101,6 +138,8 @@ class TimedPath(Frozen):
     shares : ndarray, shape (limits, K)
         Largest share of each that is used: 1 is all of it.
     iterations : int
+    rods : RodsMass or None
+        With the rods' inertia, if the plan reckons with it; ``limits`` are then lowered.
     """
 
     name: str
@@ -116,6 +155,7 @@ class TimedPath(Frozen):
     kinds: tuple[str, ...]
     shares: np.ndarray
     iterations: int
+    rods: RodsMass | None = None
 
     @property
     def duration(self) -> float:
@@ -176,4 +216,5 @@ class TimedPath(Frozen):
             "checked": len(self.t),
             "largest_excess": self.excess,
             "iterations": self.iterations,
+            "rods": None if self.rods is None else self.rods.summary(),
         }

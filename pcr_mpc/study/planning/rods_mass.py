@@ -1,0 +1,83 @@
+"""Plans for rods that have mass: planned without it to lower limits, until with it the given ones are kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+from ...errors import ConvergenceError, PCRError
+from ...loop.demand.feasibility import reference_demand, reference_of
+from ...loop.scene.scene import Scene
+from .limits import PlanLimits
+from .timed_path import RodsMass, TimedPath
+
+_KINDS = {"rate": "rate_rad_s", "acceleration": "rate_change_rad_s2", "torque": "torque_Nm"}
+_EXCESS = 1e-3  # of a limit, that is none
+_ROUNDS = 8
+_SPARE = 2e-4  # by which a limit is lowered more than it must be
+_REST = 5  # periods
+
+
+def with_rods(
+    scene: Scene, limits: PlanLimits, carried: float, planned_for: Callable[[PlanLimits], TimedPath]
+) -> TimedPath:
+    """Plan to limits that are lowered until the plan keeps the given ones with the inertia that the controller knows.
+
+    Motor angles with inertia are those of `feed_forward`, from period to period, as `check_scene` has them. Without a
+    tuning, or with ``inertia = "none"`` in its model, it is one plan for rods without mass.
+
+    Parameters
+    ----------
+    scene : Scene
+    limits : PlanLimits
+    carried : float
+        By the tip, besides its own mass [kg].
+    planned_for : callable
+        Plans for rods without mass.
+
+    Raises
+    ------
+    ConvergenceError
+        The limits are not kept after some plans, or the inverse dynamics did not settle.
+    """
+    inertia = scene.tuning.model.inertia if scene.tuning is not None else "none"
+    lowered = limits
+    for rounds in range(1, _ROUNDS + 1):
+        planned = planned_for(lowered)
+        if inertia == "none":
+            return planned
+        asked = _asked(scene, planned, carried)
+        shares = {kind: value / getattr(limits, kind) for kind, value in asked.items()}
+        if max(shares.values()) <= 1.0 + _EXCESS:
+            return replace(planned, rods=RodsMass(inertia, limits, **asked, rounds=rounds))
+        lowered = replace(
+            lowered,
+            **{kind: getattr(lowered, kind) * (1.0 - _SPARE) / share for kind, share in shares.items() if share > 1.0},
+        )
+    kind, share = max(shares.items(), key=lambda item: item[1])
+    raise ConvergenceError(
+        f"with the inertia of its rods ({inertia}) the plan of {scene.name} still asks for {share:.4g} times the "
+        f"limit on {kind} after {_ROUNDS} plans; lower the scene's limits",
+        residual=share - 1.0,
+        iterations=_ROUNDS,
+        last=asked[kind],
+    )
+
+
+def _asked(scene: Scene, planned: TimedPath, carried: float) -> dict[str, float]:
+    """Of the motors at most, with the rods' inertia."""
+    robot = scene.robot
+    count = math.ceil(planned.duration / scene.period) + _REST
+    loaded = replace(
+        scene,
+        trajectory=planned,
+        duration=scene.period * count,
+        payload=None,
+        robot=replace(robot, tip_mass=robot.tip_mass + carried) if carried else robot,
+    )
+    try:
+        demand = reference_demand(loaded, reference_of(loaded, scene.start()))
+    except PCRError as error:
+        raise type(error)(f"with the inertia of its rods: {error}", **error.details) from None
+    return {kind: float(demand[name]["asked"]) for kind, name in _KINDS.items()}
