@@ -272,9 +272,14 @@ def test_the_command_line_knows_the_methods():
 def test_what_fails_leaves_no_empty_folder(tmp_path):
     """But what is in a folder, or was there before, stays."""
     (tmp_path / "mine").mkdir()
-    with pytest.raises(OutputError), leaving_no_empty_folders():
+
+    @leaving_no_empty_folders()
+    def fails():
         for path in ("mine/a.csv", "new/deep/a.csv", "kept/a.csv"):
             require_free(tmp_path / path)
         (tmp_path / "kept" / "a.csv").write_text("1")
         raise OutputError("no", path="no")
+
+    with pytest.raises(OutputError):
+        fails()
     assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == ["kept", "kept/a.csv", "mine"]
