@@ -137,7 +137,8 @@ def advice(slowed: Slowed, kind: int, limit: float, robot: Robot, pose: Equilibr
         at_rest = f": at rest it takes {np.abs(slowed.motors(math.inf)[kind]).max():.4g} N m" if kind == 2 else ""
         return f"slower does not help{at_rest}"
     about = "about " if pose is None else ""
-    return f"made {about}{stated:g} times as slow (time_scale) it does not"
+    # What is between the periods is not seen: a spike there shows in the periods of another time_scale.
+    return f"made {about}{stated:g} times as slow (time_scale) it does not, at the control periods"
 
 
 def _tried(slowed: Slowed, kind: int, limit: float, robot: Robot, pose: Equilibrium, stated: float) -> float:
