@@ -129,7 +129,7 @@ def side_by_side(scene, folder, seconds):
 @pytest.mark.slow
 def test_a_motor_target_that_is_shot_follows_in_c(tmp_path):
     # Three kinds of rods with different numbers: a model with weight by its potential, a target that sags, plain ones.
-    side_by_side(load_scene(SCENES / "heavy_rods.toml"), tmp_path, 1.0)
+    side_by_side(load_scene(SCENES / "heavy_rods.toml"), tmp_path, 0.8)
 
 
 @needs_compiler
@@ -180,9 +180,7 @@ def hostile(rng, k, x):
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("tuning", "solver", "most"), [("lemniscate", "osqp", 25), ("lemniscate", "daqp", 15), ("default", "osqp", 25)]
-)
+@pytest.mark.parametrize(("tuning", "solver", "most"), [("default", "osqp", 25), ("lemniscate", "daqp", 15)])
 def test_the_worst_leads_to_the_same_rungs(tuning, solver, most, tmp_path):
     # Few iterations and a load that throws the tip about: every rung of the ladder has its turn.
     tuning = load_tuning(ROOT / "controllers" / f"{tuning}.toml")
@@ -264,9 +262,9 @@ def test_the_longest_step_is_the_iterations_allowed_times_what_one_costs():
 @pytest.mark.slow
 def test_steps_in_c_are_timed_one_by_one(monkeypatch):
     monkeypatch.setenv("MAKEFLAGS", f"CC={CC} CFLAGS=-O0 GRAPH_CFLAGS=-O0")
-    scene = replace(load_scene(SCENES / "lemniscate.toml"), duration=0.5)
-    found = time_in_c(scene, "osqp", 75)
-    assert (found["control"].shape, found["plant"].shape) == ((100, 2), (1000, 2))  # whole runs
+    scene = replace(load_scene(SCENES / "lemniscate.toml"), duration=0.2)
+    found = time_in_c(scene, "osqp", 35)
+    assert (found["control"].shape, found["plant"].shape) == ((40, 2), (400, 2))  # whole runs
     assert (found["plant"] > 0).all()
     worst, longest = found["worst"], found["control"][:, 0].reshape(2, -1).min(axis=0).max()
     assert worst["iterations"] == scene.tuning.max_iterations
