@@ -9,6 +9,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 
@@ -22,6 +23,11 @@ DATA = Path(__file__).parent / "data"
 # Workers of a run on all cores inherit what is set here, and look for the compiler in the other variable.
 COMPILER = os.environ.setdefault("COMPILER_OF_TESTS", os.environ.get("CC", "cc"))
 os.environ["CC"] = ""
+# A busy machine is no failure of what is tested.
+hypothesis.settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("any machine")
 
 
 @pytest.fixture(scope="session")

@@ -52,7 +52,7 @@ def test_away_from_the_stops_nothing_changes(limits):
     assert (limits.kept(u, np.zeros(2), np.zeros(2), DT) == u).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.integers(0, 2**32 - 1),
     st.floats(0.05, 20.0),
