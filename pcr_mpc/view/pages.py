@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
-_AHEAD = 3  # frames that a page may not have drawn yet
+_AHEAD = 5  # frames that a page may not have drawn yet: three wait in it for the screen
 _UNHEARD = 200  # messages that wait for a page, beyond which nobody is there
 
 

@@ -19,6 +19,7 @@ from .session import Session
 
 FRAMES = 60.0  # a second
 _WAKE = 0.002  # s, between looks at the clock
+_LATE = 2.0  # frames that may be made up for
 _SLIP = 0.1  # s of real time by which it may be behind; what is more is lost
 _QUEUE = 200  # commands that may wait
 
@@ -110,7 +111,7 @@ class Runner(threading.Thread):
             if now - second >= 1.0:
                 self._ratio, second, passed = passed / (now - second), now, 0.0
             if now >= next_frame:
-                next_frame = max(next_frame + 1.0 / FRAMES, now)
+                next_frame = max(next_frame + 1.0 / FRAMES, now - _LATE / FRAMES)
                 self._show(session)
             wait = min(_WAKE, next_frame - time.monotonic())
             if owed < session.rig.dt and wait > 0.0:

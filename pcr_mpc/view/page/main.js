@@ -1,6 +1,8 @@
 "use strict";
 // The page: messages in, one drawing for each frame of the screen, commands out.
 
+const READ_EVERY = 90;  // ms
+
 (() => {
   const data = JSON.parse($("data").textContent);
   const live = data === null;
@@ -57,7 +59,7 @@
     frame(message) {
       frame = message;
       queue.push(message);
-      if (queue.length > 2) queue.shift();
+      if (queue.length > 3) queue.shift();
     },
     role(message) { role = message; panel.setRole(role); },
     error(message) { panel.banner(message.message); },
@@ -93,10 +95,23 @@
   $("workspace").onchange = (event) => { canvas.show.workspace = event.target.checked; canvas.backdrop = null; drawLegend(); };
   $("scrub").oninput = (event) => send({ do: "scrub", i: Number(event.target.value) });
 
-  let planned = false;
+  let planned = false, unread = null, readAt = 0, waited = 0;
+  // Figures and strips are read, the robot is watched: a few a second leave it the screen's time.
+  function read(now) {
+    if (!unread || now - readAt < READ_EVERY) return;
+    panel.take(unread);
+    for (const strip of strips) strip.draw(canvas.colour);
+    if (data) $("scrub").value = unread.n;
+    [unread, readAt] = [null, now];
+  }
+
   function turn(now) {
     requestAnimationFrame(turn);
     if (!about) return;
+    read(now);
+    // Frames that came late in a bunch are all drawn; what then waits for a second is not worth being late for.
+    waited = queue.length > 1 ? waited + 1 : 0;
+    if (waited > 60) { queue.shift(); waited = 0; }
     const fresh = queue.shift();
     if (!fresh) {
       if (canvas.flashes.length) canvas.draw(canvas.last, now / 1000);
@@ -111,9 +126,7 @@
     const error = fresh.target ? 1000 * Math.hypot(fresh.p[0] - fresh.target[0], fresh.p[1] - fresh.target[1]) : null;
     strips[0].take(fresh.t, fresh.u);
     strips[1].take(fresh.t, [error]);
-    panel.take(fresh);
-    for (const strip of strips) strip.draw(canvas.colour);
-    if (data) $("scrub").value = fresh.n;
+    unread = fresh;
     if (Boolean(fresh.plan) !== planned) { planned = Boolean(fresh.plan); drawLegend(); }
     window.pcr.frames += 1;
     link.drawn(fresh);

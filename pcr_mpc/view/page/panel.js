@@ -12,6 +12,9 @@ function make(tag, properties = {}, ...children) {
   return element;
 }
 
+// What is set is laid out and painted anew, even where nothing changes.
+function put(element, name, value) { if (element[name] !== value) element[name] = value; }
+
 class Panel {
   constructor(send) {
     this.send = send;
@@ -60,7 +63,7 @@ class Panel {
     for (const [name, dial] of Object.entries(about.dials)) {
       const value = make("span", { className: "value" });
       const input = make("input", { type: "range", id: `dial-${name}`, min: dial.least, max: dial.most, step: (dial.most - dial.least) / 200 });
-      input.oninput = () => { value.textContent = this.shown(dial, Number(input.value)); };
+      input.oninput = () => { value.textContent = this.shown(dial, Number(input.value)); delete input.dataset.shown; };
       // Only once it is let go: what a controller is told of makes it begin anew.
       input.onchange = () => this.send({ do: "set", name, value: Number(input.value) });
       const label = make("label", { className: "name", htmlFor: input.id, textContent: dial.label + (dial.told ? "" : " (not told)") });
@@ -74,28 +77,28 @@ class Panel {
 
   write(key, text, bad = false) {
     const field = this.figures[key];
-    if (field.textContent !== text) field.textContent = text;
+    put(field, "textContent", text);
     field.classList.toggle("bad", bad);
   }
 
   setBar(key, share, text, bad, mark = null) {
     const bar = this.bars[key];
-    bar.fill.style.width = `${100 * Math.min(1, Math.max(0, share))}%`;
-    bar.value.textContent = text;
+    put(bar.fill.style, "transform", `scaleX(${Math.min(1, Math.max(0, share)).toFixed(3)})`);
+    put(bar.value, "textContent", text);
     bar.element.classList.toggle("bad", bad);
-    bar.mark.hidden = mark === null;
-    if (mark !== null) bar.mark.style.left = `calc(${100 * Math.min(1, mark)}% - 1px)`;
+    put(bar.mark, "hidden", mark === null);
+    if (mark !== null) put(bar.mark.style, "left", `${(100 * Math.min(1, mark)).toFixed(1)}%`);
   }
 
   take(frame) {
     const { about } = this, limits = about.limits;
-    $("clock").textContent = `${frame.t.toFixed(2)} s` + (about.live ? `  ${frame.paused ? "paused" : `${(frame.ratio ?? 1).toFixed(2)} ×`}` : "");
+    put($("clock"), "textContent", `${frame.t.toFixed(2)} s` + (about.live ? `  ${frame.paused ? "paused" : `${(frame.ratio ?? 1).toFixed(2)} ×`}` : ""));
     const error = frame.target && 1000 * Math.hypot(frame.p[0] - frame.target[0], frame.p[1] - frame.target[1]);
     this.write("error", error === null || error === undefined ? "–" : length(error));
     const limited = frame.limits && frame.limits.length ? ` (${frame.limits.join(", ")})` : "";
     this.write("rung", frame.rung ? (RUNGS[frame.rung] || frame.rung) + limited : frame.hand ? "by hand" : frame.controller || "–",
       Boolean(frame.rung) && frame.rung !== "solved");
-    this.figures.rung.title = limited;
+    put(this.figures.rung, "title", limited);
     this.write("tip", `${(1000 * frame.p[0]).toFixed(1)}, ${(1000 * frame.p[1]).toFixed(1)} mm`);
     this.write("iterations", frame.iterations === null || frame.iterations === undefined ? "–" : String(frame.iterations));
     this.write("force", frame.pull ? `${Math.hypot(...frame.force).toFixed(2)} N` : "–");
@@ -116,21 +119,22 @@ class Panel {
   }
 
   press(frame) {
-    $("pause").textContent = frame.paused ? "Run" : "Pause";
-    $("pause").setAttribute("aria-pressed", String(Boolean(frame.paused)));
+    put($("pause"), "textContent", frame.paused ? "Run" : "Pause");
+    put($("pause"), "ariaPressed", String(Boolean(frame.paused)));
     if (!this.about.live) return;
-    $("follow").setAttribute("aria-pressed", String(frame.following));
+    put($("follow"), "ariaPressed", String(frame.following));
     $("follow").disabled = this.looking || !this.about.path || !frame.steers;
     $("stop").disabled = $("tool-target").disabled = this.looking || !frame.steers;
-    $("record").textContent = frame.recording === null ? "Record" : `Stop recording, ${frame.recording.toFixed(1)} s`;
-    $("record").setAttribute("aria-pressed", String(frame.recording !== null));
+    put($("record"), "textContent", frame.recording === null ? "Record" : `Stop recording, ${frame.recording.toFixed(1)} s`);
+    put($("record"), "ariaPressed", String(frame.recording !== null));
     const choose = (id, value) => { if (document.activeElement !== $(id) && $(id).value !== String(value)) $(id).value = String(value); };
     choose("controller", frame.controller);
     choose("mode", frame.start);
     choose("speed", frame.speed);
     for (const [name, { input, value, dial }] of Object.entries(this.dials)) {
       if (document.activeElement === input) continue;
-      input.value = frame.set[name];
+      if (Number(input.dataset.shown) === frame.set[name]) continue;
+      input.value = input.dataset.shown = frame.set[name];
       value.textContent = this.shown(dial, frame.set[name]);
     }
   }
