@@ -170,6 +170,23 @@ class Table:
             raise self.fail(key, f"expected {expected}, found {value!r}")
         return value
 
+    def file(self, key: str, default: Any = _REQUIRED) -> Any:
+        """Take the path of another file, which is relative to the folder of this one; it must be there."""
+        value = self.text(key, default)
+        if value is default:
+            return default
+        path = self.path.parent / value
+        if not path.exists():
+            raise self.fail(key, f"{path}: no such file or folder{self._elsewhere(value)}")
+        return path
+
+    def _elsewhere(self, value: str) -> str:
+        """From where a path is relative, and how the file is called from there that somebody may have meant."""
+        if Path(value).is_absolute():
+            return ""
+        said = f"; a path in this file is relative to its folder, {self.path.parent.resolve()}"
+        return f'{said}: write "{seen_from(Path(value), self.path.parent)}"' if Path(value).exists() else said
+
     def peek(self, key: str) -> Any:
         """Look at a value without taking it; None if it is not there."""
         return self._data.get(key)
@@ -212,6 +229,14 @@ class Table:
         if not isinstance(value, list) or not value or not all(isinstance(v, dict) for v in value):
             raise self.fail(key, f"expected [[{key}]] tables, found {value!r}")
         return [Table(self.path, f"{self.name}{key}[{i}].", v) for i, v in enumerate(value)]
+
+
+def seen_from(path: Path, folder: Path) -> str:
+    """Name of a file for use in a TOML file in ``folder``: relative to it, absolute where there is no such way."""
+    try:
+        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return path.resolve().as_posix()
 
 
 def read_toml(path: str | Path) -> Table:

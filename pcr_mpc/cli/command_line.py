@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import math
 import os
 import sys
 import traceback
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from .. import interrupt
 from ..files import leaving_no_empty_folders
-from .parser import LEAST, parser
+from .parser import ABOVE_ZERO, ENDINGS, LEAST, parser
 
 # Arguments that name a file: a path, or the name of one of these kinds that comes with the package.
 _FILES = {
@@ -67,6 +68,12 @@ def _check(options: argparse.Namespace) -> None:
     for name, least in LEAST.items():
         if (value := getattr(options, name, None)) is not None and value < least:
             raise ValueError(f"--{name} is {value}, expected at least {least}")
+    for name, unit in ABOVE_ZERO.items():
+        if (value := getattr(options, name, None)) is not None and not 0.0 < value < math.inf:
+            raise ValueError(f"--{name.replace('_', '-')} is {value:g} {unit}, expected a finite number > 0")
+    ending = ENDINGS.get(options.run[1])
+    if ending and options.out is not None and options.out.suffix.lower() != ending:
+        raise ValueError(f"--out is {options.out}, expected a name that ends with {ending}")
     with interrupt.nothing_to_lose():
         from ..toml_table import read_toml
 

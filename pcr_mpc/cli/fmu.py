@@ -25,8 +25,6 @@ def fmu(options: argparse.Namespace) -> int:
     tuning = check_scope(scene, tuning)
     require_platform()
     path = options.out or Path("build") / f"{identifier(scene.name, options.part)}.fmu"
-    if path.suffix != ".fmu":
-        raise ValueError(f"--out is {path}, expected a name that ends with .fmu")
     require_free(path, force=options.overwrite)
     subject = Subject.of_scene(scene, tuning)
     print(f"{scene.name}: compiling the {options.part} as a model of FMI {options.version}.0 ...", file=sys.stderr)

@@ -39,6 +39,16 @@ Where a file is wanted, a name is one of pcr-mpc models; a path, such as ./mine/
 
 # Least values of the options that are whole numbers.
 LEAST = {"seed": 0, "links": 2, "steps": 1, "trials": 1, "jobs": 1, "episodes": 1, "cells": 8, "poses": 1, "silence": 1}
+# Options that are lengths, times and the like; each has a unit, in which it is given back where it is wrong.
+ABOVE_ZERO = {
+    "tolerance": "mm", "tip_speed": "m/s", "tip_acceleration": "m/s^2", "tip_jerk": "m/s^3", "duration": "s",
+    "period": "s",
+}  # fmt: skip
+# How the file ends that a command writes, by the function that runs it: it would be taken for another kind.
+ENDINGS = {
+    "plan": ".csv", "fmu": ".fmu", "identify_robot": ".toml", "tune_controller": ".toml", "export": ".xml",
+    "replay": ".html",
+}  # fmt: skip
 
 
 class _Version(argparse.Action):

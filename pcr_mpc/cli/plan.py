@@ -15,6 +15,7 @@ from ..loop.scene.file import load_scene
 from ..report.plan_table import plan_table
 from ..study.planning.limits import PlanLimits
 from ..study.planning.plan import plan_timing
+from ..toml_table import seen_from
 
 
 def plan(options: argparse.Namespace) -> int:
@@ -55,8 +56,20 @@ def plan(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(summary))
     else:
-        print(f"\n{plan_table(summary)}\n\nwritten to {folder / out.name}; to track it, put into a scene:")
-        print(f'[reference]\nkind = "file"\nfile = "{folder / out.name}"')
+        print(f"\n{plan_table(summary)}\n\nwritten to {folder / out.name}; {_use(options, folder / out.name)}")
     if problem:
         raise OutputError(problem, path=str(folder))
     return 0
+
+
+def _use(options: argparse.Namespace, file: Path) -> str:
+    """What to write into which scene, whose paths are relative to its own folder."""
+    if "scene" in options.named:
+        scene = options.scene.stem
+        place, named = f"a copy of {scene} (pcr-mpc copy {scene} FOLDER)", file.resolve().as_posix()
+    else:
+        place, named = str(options.scene), seen_from(file, options.scene.parent)
+    return (
+        f"to track it, put into {place}, instead of its [reference] and its duration:\n"
+        f'[reference]\nkind = "file"\nfile = "{named}"'
+    )

@@ -113,6 +113,10 @@ def test_timing(scene, tmp_path, capsys, monkeypatch):
     ("arguments", "message"),
     [
         (["track", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["plan", "waypoints", "--tolerance", "-1"], "--tolerance is -1 mm, expected a finite number > 0"),
+        (["plan", "waypoints", "--tip-speed", "nan"], "--tip-speed is nan m/s, expected a finite number > 0"),
+        (["plan", "waypoints", "--out", "fast.toml"], "--out is fast.toml, expected a name that ends with .csv"),
+        (["tune", "waypoints", "--out", "a.csv"], "--out is a.csv, expected a name that ends with .toml"),
         (["statics", str(MODELS / "planar_pair.toml")], "give --p, --q or both"),
         (["statics", str(MODELS / "planar_pair.toml"), "--p", "0.5", "0.5"], "move the tip at least"),
         (["statics", str(MODELS / "planar_pair.toml"), "--p", "0", "0.2", "--q", "1"], r"q has shape (1,)"),

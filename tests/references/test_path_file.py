@@ -78,9 +78,15 @@ def test_velocities_and_accelerations_are_taken(tmp_path):
             GOOD.replace("\n0.4", "\n0.2").replace("\n0.7", "\n0.1"),
             r"row 4 \(line 5\), t_s = 0.2, is earlier than the row before, t_s = 0.3; so are 1 more rows; sort",
         ),
-        (GOOD.replace("0.25", "250"), r"reach 250 m: are these millimetres\?"),
+        (
+            GOOD.replace("0.25", "250"),
+            r"reach 250 m, .* millimetres \(0.25 m\) divide them by 1000, .* centimetres \(2.5 m\) by 100",
+        ),
         ("t_s,x_m,y_m\n" + "".join(f"{33 * i},0.0{i},0.2\n" for i in range(1, 30)), r"in 29 rows: are these milli"),
         (GOOD[:38], "2 rows, expected at least 4"),
+        (GOOD[:25], "1 row, expected at least 4"),
+        (GOOD[:12], "has no rows below its header"),
+        ("t_s,x_m,y_m,vx_m_s,vy_m_s\n0,0,0.2,0,0\n", "1 row, expected at least 2"),
         ('t_s,x_m,y_m\n0,"0,0.2\n', "line 2 has 2 values|is no CSV"),
     ],
 )
@@ -180,5 +186,17 @@ def test_a_scene_finds_its_file_and_its_record_needs_none(tmp_path):
     assert back == short
     again = simulate(back, back.make_plant(), make_controller(back))
     assert again.hash() == run.hash()
-    with pytest.raises(ModelError, match=r"mine/circle_60mm\.csv: no such file"):
+    with pytest.raises(ModelError, match=r"mine/circle_60mm\.csv: no such file .* relative to its folder, .*mine$"):
         load_scene(folder / "scene.toml")
+
+
+def test_a_file_that_is_named_from_the_working_folder_is_found_for_the_message(tmp_path, monkeypatch):
+    scene = (SCENES / "circle_from_file.toml").read_text()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "here.csv").write_text(GOOD)
+    (tmp_path / "mine" / "scene.toml").write_text(
+        scene.replace("../../", f"{MODELS.parent}/").replace("../", f"{MODELS}/").replace("circle_60mm", "here")
+    )
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelError, match=r'reference\.file: mine/here\.csv: no such .*: write "\.\./here\.csv"$'):
+        load_scene("mine/scene.toml")

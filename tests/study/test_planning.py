@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -400,6 +401,23 @@ def test_a_path_through_a_fold_says_where(scene):
     trajectory = Line(points=((-0.06, 0.22), (0.1, -0.2)), speed=0.1)
     with pytest.raises((UnstableError, ConvergenceError, UnreachableError), match=r"the path at .* mm from its start"):
         plan_timing(replace(scene, trajectory=trajectory))
+
+
+def test_the_lines_that_are_to_be_put_into_a_scene_are_found_from_there(planned, tmp_path, monkeypatch, capsys):
+    mine = tmp_path / "mine" / "scene.toml"
+    mine.parent.mkdir()
+    text = (MODELS / "scenes" / "eight_points.toml").read_text()
+    mine.write_text(text.replace("../../", f"{MODELS.parent}/").replace('"../', f'"{MODELS}/'))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pcr_mpc.cli.plan.plan_timing", lambda *_, **__: planned)
+    for given in ("mine/scene.toml", "eight_points"):
+        for out in (["--out", "fast.csv"], []):
+            assert main(["plan", given, "--no-pictures", *out]) == 0
+            lines = capsys.readouterr().out.partition("[reference]\n")[2]
+            kept = re.sub(r"^\[reference\]\n(\w.*\n)*|^duration.*", "", mine.read_text(), flags=re.MULTILINE)
+            (mine.parent / "fast.toml").write_text(f"{kept}\n[reference]\n{lines}")
+            found = load_scene(mine.parent / "fast.toml")
+            assert planned.duration <= found.duration < planned.duration + 10 * found.period
 
 
 def test_the_command_writes_a_path_and_a_picture(tmp_path, capsys):

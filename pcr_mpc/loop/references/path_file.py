@@ -45,6 +45,8 @@ def load_path(file: str | Path, *, smoothing: float | None = None, closed: bool 
     if not lines:
         raise _wrong(path, f"is empty; its first line has the columns: {','.join(_COLUMNS)}")
     names = _header(path, lines[0][1])
+    if len(lines) == 1:
+        raise _wrong(path, "has no rows below its header")
     rows = np.array([_row(path, number, names, cells) for number, cells in lines[1:]]).reshape(-1, len(names))
     table = dict(zip(names, rows.T, strict=True))
     _require_order(path, table["t_s"], [number for number, _ in lines[1:]])
@@ -145,7 +147,11 @@ def _require_order(path: Path, t: np.ndarray, lines: list[int]) -> None:
 def _question_units(path: Path, table: dict[str, np.ndarray]) -> None:
     far = max(float(np.abs(table[name]).max(initial=0.0)) for name in ("x_m", "y_m"))
     if far > _FAR:
-        raise _wrong(path, f"x_m and y_m reach {far:g} m: are these millimetres? Divide them by 1000")
+        raise _wrong(
+            path,
+            f"x_m and y_m reach {far:g} m, expected metres: if they are millimetres ({far / 1e3:.3g} m) divide them by "
+            f"1000, if they are centimetres ({far / 1e2:.3g} m) by 100",
+        )
     t = table["t_s"]
     if len(t) > 1 and t[-1] - t[0] > _LONG and np.median(np.diff(t)) > _STEP:
         raise _wrong(

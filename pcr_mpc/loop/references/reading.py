@@ -128,9 +128,9 @@ def _through(table: Table) -> dict[str, Any]:
 
 
 def _file(table: Table) -> Tabulated:
-    file = table.text("file")
+    file = table.file("file")
     smoothing = table.number("smoothing", minimum=0.0) if table.has("smoothing") else None
-    return load_path(table.path.parent / file, smoothing=smoothing, closed=_closed(table))
+    return load_path(file, smoothing=smoothing, closed=_closed(table))
 
 
 def _closed(table: Table) -> bool:

@@ -55,12 +55,9 @@ class Tabulated:
 
     def __post_init__(self) -> None:
         times = self._table("times", 1)
-        if len(times) < 2 or (np.diff(times) <= 0.0).any():
-            i = int(np.argmax(np.diff(times) <= 0.0)) + 1 if len(times) > 1 else 0
-            raise ModelError(
-                f"times: row {i} is not after the row before; expected at least 2 rows in order", key="times"
-            )
-        object.__setattr__(self, "times", tuple((times - times[0]).tolist()))
+        if (np.diff(times) <= 0.0).any():
+            i = int(np.argmax(np.diff(times) <= 0.0)) + 1
+            raise ModelError(f"times: row {i} is not after the row before; expected rows in order", key="times")
         for name in ("points", "velocities", "accelerations"):
             if getattr(self, name) is not None:
                 rows = self._table(name, 2)
@@ -78,9 +75,11 @@ class Tabulated:
         kind = "smoothed" if self.smoothing else "rows" if self.velocities is None else "hermite"
         if len(times) < _LEAST[kind]:
             raise ModelError(
-                f"points: {len(times)} rows, expected at least {_LEAST[kind]}; way-points are kind 'waypoints'",
+                f"points: {len(times)} row{'s' * (len(times) != 1)}, expected at least {_LEAST[kind]}; way-points are "
+                "kind 'waypoints'",
                 key="points",
             )
+        object.__setattr__(self, "times", tuple((times - times[0]).tolist()))
         if self.closed:
             self._require_closed()
 

@@ -39,7 +39,7 @@ def load_scene(path: str | Path) -> Scene:
     """
     with read_toml(path) as file:
         name = file.text("name")
-        robot = load_robot(file.path.parent / file.text("robot"))
+        robot = load_robot(file.file("robot"))
         with file.table("reference") as reference:
             trajectory = read_reference(reference)
         with file.table("limits", {}) as limits:
@@ -71,7 +71,7 @@ def load_scene(path: str | Path) -> Scene:
         with file.table("control") as control:
             period = control.number("period", above=0.0)
             duration = _duration(file, trajectory, period)
-            tuning = control.text("tuning", None)
+            tuning = control.file("tuning", None)
             delay = control.integer("delay", 0, minimum=0)
             untold_delay = control.number("untold_delay", 0.0, minimum=0.0)
             deadline = control.number("deadline", math.inf, minimum=0.0)
@@ -85,7 +85,7 @@ def load_scene(path: str | Path) -> Scene:
         payload = read_payload(file)
         (need, margin), finding, moved_by = read_need(file), read_finding(file), read_motors(file)
         scene = Scene(name, robot, duration, tip, motors, mode, velocity, trajectory, plant, period,
-                      tuning and load_tuning(file.path.parent / tuning), force, noise, angle_step,
+                      tuning and load_tuning(tuning), force, noise, angle_step,
                       delay, deadline, late, pose_limits, payload, need, finding,
                       wrapped=wrapped, tracking_error=tracking_error, untold_delay=untold_delay,
                       motors=moved_by, delay_margin=margin, camera=camera)  # fmt: skip
