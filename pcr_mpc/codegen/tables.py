@@ -264,6 +264,8 @@ def tables(subject: Subject) -> str:
         array("double", "pcr_scene_mass", given["mass"].ravel(order="F")),
         array("double", "pcr_scene_memory", plant.memory(x)),
         array("double", "pcr_scene_plant_numbers", plant.numbers),
+        array("double", "pcr_number_ranges", model_kind.ranges),
+        array("double", "pcr_plant_number_ranges", plant.step_model.kind.ranges),
         array("double", "pcr_plant_limits", np.fmax(step_limits(plant.step_model), [subject.rounding, 0, 0, 0, 0])),
         array("int", "pcr_in_places", np.array([0, *np.cumsum(_inputs(foresight)[1])[:-1]])),
         array("int", "pcr_out_places", np.array([0, *np.cumsum(_outputs(foresight)[1])[:-1]])),

@@ -20,7 +20,7 @@ from .uncertainty import read_uncertainty
 
 # Strain of a rod that can stretch beyond which no rod is elastic.
 _LARGEST_STRAIN = 0.01
-_ROBOT_NUMBERS = {
+ROBOT_NUMBERS = {
     "tip_mass": POSITIVE,
     "drag": NOT_NEGATIVE,
     "rate_limit": POSITIVE,
@@ -70,7 +70,7 @@ class Robot(Frozen):
     def __post_init__(self) -> None:
         if problem := name_problem(self.name):
             raise ModelError(f"name: {problem}", key="name")
-        check_numbers(self, _ROBOT_NUMBERS)
+        check_numbers(self, ROBOT_NUMBERS)
         object.__setattr__(self, "gravity", tuple(checked_vector("gravity", self.gravity, 2).tolist()))
         object.__setattr__(self, "rods", tuple(self.rods))
         for rod in self.rods:
@@ -215,9 +215,9 @@ def load_robot(path: str | Path) -> Robot:
         read_uncertainty(file)  # how well the numbers are known is nothing of the robot's, but must be right
         with file.table("tip") as tip, file.table("motors") as motors:
             numbers = {
-                "tip_mass": tip.number("mass", **_ROBOT_NUMBERS["tip_mass"]),
-                "drag": tip.number("drag", **_ROBOT_NUMBERS["drag"]),
-                **{key: motors.number(key, **_ROBOT_NUMBERS[key])
+                "tip_mass": tip.number("mass", **ROBOT_NUMBERS["tip_mass"]),
+                "drag": tip.number("drag", **ROBOT_NUMBERS["drag"]),
+                **{key: motors.number(key, **ROBOT_NUMBERS[key])
                    for key in ("rate_limit", "acceleration_limit", "torque_limit")},
             }  # fmt: skip
         return Robot(name=name, rods=tuple(rods), gravity=gravity, **numbers)

@@ -17,9 +17,10 @@ from .materials import MATERIALS, Material, Section, check_unit
 # SI units; wide enough for DNA and for bridges, and no product of a few such numbers overflows.
 POSITIVE = {"minimum": 1e-30, "maximum": 1e30}
 NOT_NEGATIVE = {"minimum": 0.0, "maximum": 1e30}
-_ROD_NUMBERS = {"length": POSITIVE, "bending_stiffness": POSITIVE, "line_density": NOT_NEGATIVE}
+ROD_NUMBERS = {"length": POSITIVE, "bending_stiffness": POSITIVE, "line_density": NOT_NEGATIVE}
+MOST_CURVED = 1e30  # at rest, either way [1/m]
 # Of EI along a rod, relative to EI.
-_STIFFNESS_RANGE = (1e-3, 1e3)
+STIFFNESS_RANGE = (1e-3, 1e3)
 _MOST_KNOTS = 65  # of a property along a rod
 # Angles beyond four turns are rather degrees [rad].
 MANY_TURNS = 8.0 * math.pi
@@ -73,9 +74,9 @@ class Rod:
     strain_limit: float = math.inf
 
     def __post_init__(self) -> None:
-        check_numbers(self, _ROD_NUMBERS)
-        lowest, highest = _STIFFNESS_RANGE
-        _check_profile(self, "curvature", minimum=-1e30, maximum=1e30)
+        check_numbers(self, ROD_NUMBERS)
+        lowest, highest = STIFFNESS_RANGE
+        _check_profile(self, "curvature", minimum=-MOST_CURVED, maximum=MOST_CURVED)
         _check_profile(self, "stiffness_factors", minimum=lowest, maximum=highest)
         if self.axial_stiffness != math.inf:
             check_numbers(self, {"axial_stiffness": POSITIVE})

@@ -289,6 +289,13 @@ def test_a_controller_says_what_it_makes_of_its_input(units):
         controller.step((40 + j / 4) * PERIOD, PERIOD / 4)
         held.append(controller.get(RATES))
     assert np.ptp(held, axis=0).max() == 0.0
+    for name, value in (("tip_mass", -1.0), ("limits.angle_lower[0]", 9.0), ("weights.input", 0.0)):
+        for part in PARTS if name == "tip_mass" else ("controller",):
+            refused = units(part)
+            refused.set({name: value})
+            with pytest.raises(fmpy.fmi1.FMICallException):
+                refused.step(0.0, PERIOD)
+            assert f"{name} = {value:g} is refused" in refused.said[0]
     wrong = units("controller")
     with pytest.raises(fmpy.fmi1.FMICallException):
         wrong.decide(0, 1e3 * rest)

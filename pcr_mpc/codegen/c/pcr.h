@@ -21,7 +21,7 @@ typedef double pcr_real;
 typedef enum {
     PCR_OK = 0,
     PCR_NOT_STARTED = 1,       /* call pcr_controller_init or pcr_plant_init first */
-    PCR_ARGUMENT = 2,          /* a number is not finite, or an array is missing */
+    PCR_ARGUMENT = 2,          /* a number is not finite or not one that a robot can have, or an array is missing */
     PCR_FIRST_MEASUREMENT = 3, /* the very first measurement is in other units: degrees, millimetres, whole turns off */
     PCR_OUT_OF_REACH = 4,      /* the rods cannot follow to that pose from where they are: plant and start only */
     PCR_NOT_HERE = 5           /* pcr_plant_init and pcr_plant_set_numbers, of a plant that knows only its start */
@@ -68,7 +68,8 @@ enum {
     PCR_DOUBT_ANGLES_INSIST = 8
 };
 
-/* Numbers that may be changed while it runs. pcr_scene_parameters are those of the scene. */
+/* Numbers that may be changed while it runs. pcr_scene_parameters, in
+   pcr_tables.h, are those of the scene. */
 typedef struct {
     double numbers[PCR_NUMBERS];                /* of the robot, as listed in README.md */
     double weights[4];                          /* position [1/m^2], velocity [1/(m/s)^2], angle [1/rad^2], input
@@ -178,8 +179,12 @@ pcr_result pcr_controller_init(pcr_controller *controller, const pcr_pose *pose)
 /* Decide for one control period. */
 pcr_result pcr_controller_step(pcr_controller *controller, const pcr_measurement *measured, pcr_output *output);
 
-/* Let other numbers take effect from the next step on: estimates, commands on the way and the last plan are kept. */
+/* Let other numbers take effect from the next step on: estimates, commands on the way and the last plan are kept. What
+   no robot can have (a negative mass, stops that cross) is refused with PCR_ARGUMENT, and nothing has changed. */
 pcr_result pcr_controller_set_parameters(pcr_controller *controller, const pcr_parameters *parameters);
+
+/* Which number of them is refused, counted from the first of the structure; -1: none. */
+int pcr_refused_parameter(const pcr_parameters *parameters);
 
 /* Go on from where another controller was when its bytes were copied to `saved`, in whatever place or process that was:
    the only way to use a copy. */
@@ -197,8 +202,11 @@ pcr_result pcr_plant_step(pcr_plant *plant, const double *u, const double *force
 pcr_result pcr_plant_carry(pcr_plant *plant, double payload);
 
 /* Let the robot have other numbers, as listed in README.md, in the same state; of the plants that pcr_plant_init knows
-   elsewhere. Where it returns PCR_OUT_OF_REACH the plant is as it was. */
+   elsewhere. Where it does not return PCR_OK the plant is as it was. */
 pcr_result pcr_plant_set_numbers(pcr_plant *plant, const double *numbers);
+
+/* Which of the numbers no robot can have, by its place; -1: none. */
+int pcr_plant_refused_number(const double *numbers);
 
 /* Motor angles as encoders see them [rad]: those of the clamps, plant->x + 4, unless the motors have play. */
 pcr_result pcr_plant_angles(const pcr_plant *plant, double *q);

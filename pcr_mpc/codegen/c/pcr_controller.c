@@ -122,23 +122,6 @@ static void write_parameters(pcr_controller *c)
     check[PCR_CHECK_CLEAR] = c->clear;
 }
 
-static int sound(const pcr_parameters *p)
-{
-    const double *all = (const double *)p;
-    const double *bound = &p->rate; /* from here on infinite ones are none */
-    for (const double *at = all; at < bound; at++) {
-        if (!isfinite(*at)) {
-            return 0;
-        }
-    }
-    for (const double *at = bound; at < all + sizeof *p / sizeof *all; at++) {
-        if (isnan(*at)) {
-            return 0;
-        }
-    }
-    return p->rate > 0.0 && p->rate_change > 0.0;
-}
-
 pcr_result pcr_controller_init(pcr_controller *c, const pcr_pose *pose)
 {
     const pcr_pose *at = pose == NULL ? &pcr_scene_pose : pose;
@@ -196,7 +179,7 @@ pcr_result pcr_controller_set_parameters(pcr_controller *c, const pcr_parameters
     if (c == NULL || !c->started) {
         return PCR_NOT_STARTED;
     }
-    if (parameters == NULL || !sound(parameters)) {
+    if (parameters == NULL || pcr_refused_parameter(parameters) >= 0) {
         return PCR_ARGUMENT;
     }
     const int has_plan = c->has_plan, has_states = c->has_states, age = c->age;

@@ -64,20 +64,12 @@ pcr_result pcr_plant_set_numbers(pcr_plant *plant, const double *numbers)
     if (!PCR_PLANT_AS_MODEL) {
         return PCR_NOT_HERE;
     }
-    if (numbers == NULL) {
+    if (numbers == NULL || pcr_plant_refused_number(numbers) >= 0) {
         return PCR_ARGUMENT;
-    }
-    for (int i = 0; i < PCR_PLANT_NUMBERS; i++) {
-        if (isnan(numbers[i])) { /* angles without stops are infinite */
-            return PCR_ARGUMENT;
-        }
     }
     memcpy(all, numbers, sizeof all);
     all[PCR_PLANT_TIP_MASS] += plant->payload;
     memcpy(record, plant->memory, PCR_PLANT_START * sizeof *record);
-    if (!(all[PCR_PLANT_TIP_MASS] > 0.0)) {
-        return PCR_ARGUMENT;
-    }
     if (bring(plant, all, record)) {
         return PCR_OUT_OF_REACH;
     }

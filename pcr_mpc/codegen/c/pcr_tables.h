@@ -23,6 +23,8 @@ extern const double pcr_scene_memory[PCR_PLANT_MEMORY];   /* of the plant there 
 extern const double pcr_plant_limits[5];                  /* of a verdict with which the rods have followed */
 extern const int pcr_in_places[PCR_INS], pcr_out_places[PCR_OUTS]; /* where inputs and outputs of the graph lie */
 extern const double pcr_scene_plant_numbers[PCR_PLANT_NUMBERS];
+/* Least and greatest of each that a robot may have: of the controller's model, and of the plant. */
+extern const double pcr_number_ranges[PCR_NUMBERS][2], pcr_plant_number_ranges[PCR_PLANT_NUMBERS][2];
 /* State at the start, and at the ends of all periods, and the force that the rods carry there. */
 extern const double pcr_scene_reference[PCR_REFERENCE_ROWS + 1][PCR_STATES + 2];
 extern const double pcr_scene_end[PCR_ROW];               /* held beyond the end of the reference */

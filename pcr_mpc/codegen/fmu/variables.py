@@ -91,11 +91,13 @@ class Layout:
     def tables(self) -> str:
         """Text of ``pcr_fmu_tables.c``."""
         starts = [variable.start for kind in ("inputs", "fixed", "tunable") for variable in self.flat(kind)]
-        names = ", ".join(f'"{variable.name}"' for variable in self.flat("inputs"))
+        names, tunables = (", ".join(f'"{variable.name}"' for variable in self.flat(kind)) or "0"
+                           for kind in ("inputs", "tunable"))  # fmt: skip
         return (
             '/* Values with which a model starts. */\n#include "pcr_fmu.h"\n\n#include <math.h>\n\n'
             f"const double pcr_fmu_starts[FMU_TUNABLE_END] = {block(np.array(starts, dtype=float))};\n"
             f"const char *const pcr_fmu_inputs[FMU_INPUTS_END] = {{{names}}};\n"
+            f"const char *const pcr_fmu_tunables[] = {{{tunables}}};\n"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,8 @@ import casadi as ca
 import numpy as np
 
 from ...frozen import read_only
-from ..robot import Robot
+from ..robot import ROBOT_NUMBERS, Robot
+from ..rod import MANY_TURNS, MOST_CURVED, POSITIVE, ROD_NUMBERS, STIFFNESS_RANGE
 from .equations import Layout
 from .physics import at_knots, normalised, robot_layout
 
@@ -24,6 +26,14 @@ _OF_ROD = {
     "angle_upper": "rad",
 }
 _OF_ROBOT = {"tip_mass": "kg", "drag": "N s/m", "gravity_x": "m/s^2", "gravity_y": "m/s^2", "rate_limit": "rad/s"}
+# What a `Robot` takes for them; any finite number for those that are not named.
+_RANGES = {name: (bounds["minimum"], bounds["maximum"]) for name, bounds in (ROD_NUMBERS | ROBOT_NUMBERS).items()} | {
+    "angle_lower": (-math.inf, MANY_TURNS),
+    "angle_upper": (-MANY_TURNS, math.inf),
+    "axial_compliance": (0.0, 1.0 / POSITIVE["minimum"]),
+    "curvature": (-MOST_CURVED, MOST_CURVED),
+    "stiffness_factors": STIFFNESS_RANGE,
+}
 
 
 @dataclass(frozen=True)
@@ -96,6 +106,15 @@ class Kind:
     def names(self) -> tuple[str, ...]:
         """Names of the numbers, in their order."""
         return tuple(self.units)
+
+    @property
+    def ranges(self) -> np.ndarray:
+        """Least and greatest value of each that a `Robot` takes, shape (size, 2); where infinite, any finite one.
+
+        Besides, its bases must differ, and the stops of a motor be in order.
+        """
+        names = (name.partition("].")[2] or name for name in self.names)
+        return np.array([_RANGES.get(name.partition("[")[0], (-math.inf, math.inf)) for name in names])
 
     @property
     def size(self) -> int:

@@ -48,6 +48,7 @@ struct fmu {
 
 extern const double pcr_fmu_starts[FMU_TUNABLE_END]; /* of inputs and parameters */
 extern const char *const pcr_fmu_inputs[FMU_INPUTS_END];
+extern const char *const pcr_fmu_tunables[]; /* and those of parameters that may change */
 
 /* NULL if the token is that of another model, or if there is no memory. */
 fmu *fmu_new(const char *name, const char *token, fmu_logger *log, void *environment, void (*callback)(void));

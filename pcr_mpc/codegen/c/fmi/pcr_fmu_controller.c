@@ -34,8 +34,9 @@ fmu_status fmu_part_tune(fmu *instance)
     pcr_parameters parameters;
     memcpy(&parameters, instance->state.reals + FMU_PARAMETERS, sizeof parameters);
     if (pcr_controller_set_parameters(&instance->state.part, &parameters) != PCR_OK) {
-        return fmu_say(instance, FMU_ERROR, "at %.9g s: these parameters are refused: one is no number, or a rate limit "
-                       "is not positive", instance->state.time);
+        const int at = pcr_refused_parameter(&parameters);
+        return fmu_say(instance, FMU_ERROR, "at %.9g s: %s = %g is refused: no robot or controller can have it beside "
+                       "the others", instance->state.time, pcr_fmu_tunables[at], ((const double *)&parameters)[at]);
     }
     return FMU_OK;
 }

@@ -15,14 +15,20 @@ static void show(fmu *instance)
 
 static fmu_status number(fmu *instance)
 {
-    switch (pcr_plant_set_numbers(&instance->state.part, instance->state.reals + FMU_NUMBERS)) {
+    const double *numbers = instance->state.reals + FMU_NUMBERS;
+    const int at = pcr_plant_refused_number(numbers);
+    if (at >= 0) {
+        return fmu_say(instance, FMU_ERROR, "at %.9g s: %s = %g is refused: no robot can have it beside the others",
+                       instance->state.time, pcr_fmu_tunables[at], numbers[at]);
+    }
+    switch (pcr_plant_set_numbers(&instance->state.part, numbers)) {
     case PCR_OK:
         return FMU_OK;
     case PCR_OUT_OF_REACH:
         return fmu_say(instance, FMU_ERROR, "at %.9g s: rods with these numbers cannot be where the robot is",
                        instance->state.time);
     default:
-        return fmu_say(instance, FMU_ERROR, "these numbers are refused: one is no number, or the tip has no mass");
+        return fmu_say(instance, FMU_ERROR, "this plant cannot have other numbers");
     }
 }
 
