@@ -59,7 +59,7 @@ def _run(options: argparse.Namespace) -> int:
         stopped = interrupt.noted() or KeyboardInterrupt in (type(error), type(error.__cause__))
         if options.traceback:
             traceback.print_exc()
-        print(f"pcr-mpc: {_message(error, stopped)}", file=sys.stderr)
+        print(f"pcr-mpc: {_message(error, stopped, options)}", file=sys.stderr)
         return interrupt.exit_status() if stopped else 1
 
 
@@ -99,13 +99,18 @@ def _found(given: str, kinds: tuple[str, ...]) -> tuple[Path, bool]:
     return shipped(given, kind or next((one for one in kinds if nearest(given, one)), kinds[0])), True
 
 
-def _message(error: BaseException, stopped: bool) -> str:
-    from ..errors import PCRError, SimulationError, described  # which load NumPy
+def _message(error: BaseException, stopped: bool, options: argparse.Namespace) -> str:
+    from ..errors import ModelError, PCRError, SimulationError, described  # which load NumPy
 
     if stopped:
         return str(error) if isinstance(error, KeyboardInterrupt | SimulationError) and str(error) else "interrupted"
     if isinstance(error, MemoryError):
         return f"out of memory: {error}".rstrip(": ")
+    if isinstance(error, ModelError) and not {"file", "said"} & set(error.details):
+        from .behind import file_behind
+
+        file = file_behind(str(error.details.get("key")), options)
+        return f"{file}: {error}" if file else str(error)
     if isinstance(error, PCRError | ValueError | OSError):
         return described(error)
     return f"{type(error).__name__}: {error}; --traceback shows where"

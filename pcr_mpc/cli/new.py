@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..design.examination import Examination, examine
+from ..design.remarks import Remark
 from ..design.sizing import Design, design
 from ..design.toml_text import files
 from ..design.wish import Wish
@@ -21,6 +22,7 @@ from ..plant.robot import load_robot
 from ..report.check_tables import check_record, check_table
 from ..report.new_table import new_record, new_table
 from ..toml_table import read_toml
+from .behind import file_behind
 
 _SLOWER = 1.25  # by which a lap is made longer until the reference keeps every limit
 _ATTEMPTS = 12
@@ -85,6 +87,7 @@ def check(options: argparse.Namespace) -> int:
         require_free(options.picture, force=options.overwrite)
     is_robot = read_toml(options.target).has("rods")
     found = examine(load_robot(options.target) if is_robot else load_scene(options.target))
+    found.remarks = [_with_file(one, options) for one in found.remarks]
     print(json.dumps(check_record(found)) if options.json else check_table(found))
     if options.picture:
         from ..report.check_picture import plot_check
@@ -94,10 +97,16 @@ def check(options: argparse.Namespace) -> int:
     return _verdict(found)
 
 
+def _with_file(remark: Remark, options: argparse.Namespace) -> Remark:
+    file = file_behind(remark.about, options) if remark.level == "error" else None
+    return remark if file is None else replace(remark, text=f"{file}: {remark.text}")
+
+
 def _verdict(found: Examination) -> int:
     """Exit status of what can run as asked; raises for what cannot."""
     if found.errors:
+        first = found.errors[0]
         more = f" (and {len(found.errors) - 1} more)" if len(found.errors) > 1 else ""
         asked = "cannot be held" if found.scene is None else "cannot run as asked"
-        raise ModelError(f"{found.name} {asked}: {found.errors[0].text}{more}", key=found.errors[0].about)
+        raise ModelError(f"{found.name} {asked}: {first.text}{more}", key=first.about, said=True)
     return 0

@@ -51,12 +51,13 @@ def track(options: argparse.Namespace) -> int:
         raise ValueError("--method has no use with --plant: MuJoCo solves no statics")
     if options.links is not None and not options.plant:
         raise ValueError("--links goes with --plant mujoco")
-    plant: SimulatedPlant = scene.make_plant()
-    if options.plant:
-        plant = MuJoCoPlant(scene.robot, links=LINKS if options.links is None else options.links, dt=scene.plant.dt)
-    elif options.method:
+    if options.method:
         scene = replace(scene, plant=replace(scene.plant, method=options.method))
-        plant = scene.make_plant()
+    plant: SimulatedPlant = (
+        MuJoCoPlant(scene.robot, links=LINKS if options.links is None else options.links, dt=scene.plant.dt)
+        if options.plant
+        else scene.make_plant()
+    )
     folder = options.out or Path("results") / scene.name
     # Rather now than after the run.
     used: Tuning | None = None if own else tuning or scene.tuning

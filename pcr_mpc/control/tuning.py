@@ -30,8 +30,10 @@ class Model:
 
     Attributes
     ----------
-    method, segments, steps, scheme
-        Discretisation of the rods (see `solve_statics`).
+    method : {"closed_form", "multiple_shooting"}, optional
+        Statics of the rods. None: the closed form where the robot's rods have one, else multiple shooting.
+    segments, steps, scheme
+        Discretisation of rods that are shot (see `solve_statics`).
     inertia : {"none", "constant", "condensed"}
         Of the rods (see `Plant`).
     linearise : {"here", "along_plan"}
@@ -51,7 +53,7 @@ class Model:
         Run as machine code where there is a C compiler: the same numbers, several times faster.
     """
 
-    method: str = "closed_form"
+    method: str | None = None
     segments: int = 8
     steps: int = 1
     scheme: str = "rk8"
@@ -67,7 +69,7 @@ class Model:
         for name in ("segments", "steps"):
             object.__setattr__(self, name, checked_integer(name, getattr(self, name)))
         for name, choices in (
-            ("method", PREDICTING),
+            *((("method", PREDICTING),) if self.method is not None else ()),
             ("scheme", SCHEMES),
             ("inertia", INERTIAS),
             ("linearise", LINEARISE),
@@ -242,7 +244,7 @@ def load_tuning(path: str | Path) -> Tuning:
             fallback=solver.text("fallback", FALLBACKS[0], choices=FALLBACKS),
             solver=solver.text("name", SOLVERS[0], choices=SOLVERS),
             model=Model(
-                method=model.text("method", Model.method, choices=PREDICTING),
+                method=model.text("method", None, choices=PREDICTING),
                 segments=model.integer("segments", Model.segments),
                 steps=model.integer("steps", Model.steps),
                 scheme=model.text("scheme", Model.scheme, choices=SCHEMES),

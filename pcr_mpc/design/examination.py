@@ -19,6 +19,7 @@ from ..plant.statics.free_tip import inverse_statics
 from ..plant.statics.stability import assess_stability
 from .demands import demands
 from .reach import Reach, explore, tips_within
+from .rehearsal import rehearse
 from .remarks import Remark, about_rods, about_start, about_steps, unidentifiable
 
 _CLAMPED_PINNED = 3.9266023  # first root of tan x = tanh x: a rod clamped at its motor, pinned at the tip
@@ -97,6 +98,7 @@ def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
         found.path, reference, remarks = demands(scene, pose)
         found.figures["reference"] = reference
         found.remarks += remarks
+        found.remarks += rehearse(scene, pose, start=reference is None or "peaks" in reference)
         steps, remarks = about_steps(scene, mass, found.figures)
         found.figures["steps"] = steps
         found.remarks += remarks

@@ -14,11 +14,13 @@ from ...control.nonlinear_mpc import NonlinearMPC
 from ...control.observer import DisturbanceObserver
 from ...control.qp import motor_bounds, stage_weights
 from ...control.tuning import Model, Tuning
+from ...errors import ModelError
 from ...linearisation.linear_model import LinearModel
 from ...linearisation.linearise import linearise
 from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.held_tip import default_method
 from ...plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 from ..hardware.past import PastEstimates
 from ..scene.scene import Scene
@@ -38,9 +40,24 @@ def motor_limits(robot: Robot, period: float) -> Limits:
 
 
 def make_model(robot: Robot, model: Model) -> Plant:
-    """Plant that is linearised."""
+    """Plant that is linearised.
+
+    Raises
+    ------
+    ModelError
+        The tuning names a method that does not hold for the robot's rods.
+    """
+    # Weight alone has its share in the closed form too, by the first order.
+    method = default_method(robot.weightless())
+    if model.method == "closed_form" != method:
+        raise ModelError(
+            f"[model] method of the tuning is 'closed_form', which is for uniform, straight, inextensible rods, and "
+            f"{robot.weightless().needs_shooting}; leave method out of [model], and what the rods need is taken, or "
+            f"set it to {method!r}",
+            key="model.method",
+        )
     return Plant(
-        robot, method=model.method, segments=model.segments, steps=model.steps, scheme=model.scheme,
+        robot, method=model.method or method, segments=model.segments, steps=model.steps, scheme=model.scheme,
         inertia=model.inertia, compiled=model.compiled,
     )  # fmt: skip
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...errors import check_numbers
+from ...errors import ModelError, check_numbers
 from ...linearisation.pose_limits import PoseLimits
 from ...methods import METHODS
 from ...plant.materials import check_unit
@@ -56,19 +56,22 @@ class PlantSettings:
     motors: str = "as_built"
 
     def make(self, robot: Robot) -> Plant:
-        """Build the plant of a robot; errors as `Plant`."""
-        return Plant(
-            robot.plain() if self.rods == "plain" else robot,
-            method=self.method,
-            segments=self.segments,
-            steps=self.steps,
-            scheme=self.scheme,
-            integrator=self.integrator,
-            dt=self.dt,
-            on_snap=self.on_snap,
-            inertia=self.inertia,
-            weight=self.weight,
-        )
+        """Build the plant of a robot; what `Plant` refuses is a `ModelError` of the table."""
+        try:
+            return Plant(
+                robot.plain() if self.rods == "plain" else robot,
+                method=self.method,
+                segments=self.segments,
+                steps=self.steps,
+                scheme=self.scheme,
+                integrator=self.integrator,
+                dt=self.dt,
+                on_snap=self.on_snap,
+                inertia=self.inertia,
+                weight=self.weight,
+            )
+        except ValueError as error:
+            raise ModelError(f"[plant] {error}", key="plant", reason=str(error)) from error
 
     def describes(self, plant: object, robot: Robot) -> bool:
         """Whether a plant of a robot is simulated like this."""

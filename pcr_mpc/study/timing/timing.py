@@ -15,6 +15,7 @@ from ...errors import PCRError
 from ...loop.controller.make_controller import make_controller
 from ...loop.controller.tracking import TrackingController
 from ...loop.demand.feed_forward import feed_forward
+from ...loop.parts.assembled import make_model
 from ...loop.run.run import Run
 from ...loop.run.simulate import simulate
 from ...loop.scene.scene import Scene
@@ -85,7 +86,7 @@ def time_scene(
             components.append(_force_times(plant, run, n).record("F, K and G", kind))
     if isinstance(controller, TrackingController):
         times, parts, iterations = _control_times(scene, run, steps, "control step" if progress else None)
-        model = scene.tuning.model.method if scene.tuning else ""
+        model = make_model(scene.robot, scene.tuning.model).method if scene.tuning else ""
         result["solvers"] = _solvers(scene, run, (times, parts, iterations), steps, progress)
         components.append(times.record("control step", model, CONTROL_HZ))
         components += [{"name": name, "method": model, **distribution(part)} for name, part in parts.items()]

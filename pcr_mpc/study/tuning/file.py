@@ -105,7 +105,7 @@ def _toml(tuning: Tuning, comments: Sequence[str]) -> str:
         f'fallback = "{tuning.fallback}"',
         "",
         "[model]                   # what is linearised",
-        f'method = "{model.method}"',
+        *([] if model.method is None else [f'method = "{model.method}"']),
         f"segments = {model.segments}",
         f"steps = {model.steps}",
         f'scheme = "{model.scheme}"',

@@ -1,0 +1,24 @@
+"""Which file is behind what is wrong with the parts of a scene, which know no files."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ..toml_table import read_toml
+
+# First word of the key, or what a remark is about.
+_OF_TUNING, _OF_SCENE = ("controller", "model", "learning", "observer"), ("plant",)
+
+
+def file_behind(key: str, options: argparse.Namespace) -> Path | None:
+    """Return the scene, or the tuning that it names, or that the options name in its place."""
+    word, scene = key.split(".")[0], getattr(options, "scene", None) or getattr(options, "target", None)
+    if scene is None or word not in (*_OF_TUNING, *_OF_SCENE):
+        return None
+    if word in _OF_SCENE:
+        return Path(scene)
+    if own := getattr(options, "controller", None):
+        return own if isinstance(own, Path) else None
+    named = read_toml(scene).table("control", {}).text("tuning", None)
+    return None if named is None else Path(scene).parent / named
