@@ -17,6 +17,8 @@ _LICENCES = {
     "daqp": "`daqp/src` and `daqp/include` are files of DAQP 0.11.0, as they are, under the MIT License "
     "(`daqp/LICENSE`).",
 }
+# Folders in which a compiler finds the headers of a solver.
+HEADERS = {"osqp": ("osqp/public", "osqp/private"), "daqp": ("daqp/include",)}
 _TEXT = Path(__file__).parent / "c" / "readme.md"
 
 
@@ -43,6 +45,7 @@ def readme(subject: Subject, run: Run, loss: Loss | None = None) -> str:
         "iterations": f"p50 {summary['qp_iterations']['p50']:g}, max {summary['qp_iterations']['max']:g}",
         "worst": str(worst),
         "worst_flops": f"{worst * each:.2g}",
+        "include": " ".join(f"-isystem {folder}" for folder in HEADERS[tuning.solver]),
         "licence": _LICENCES[tuning.solver],
         "numbers": units,
         "precision": "double" if not subject.single else f"single, which costs: {loss or 'not measured'}",

@@ -287,6 +287,16 @@ def test_sanitisers_find_nothing(each, tmp_path):
 
 
 @needs_compiler
+def test_the_program_of_the_readme_compiles_as_it_says(lemniscate, tmp_path):
+    text = (lemniscate / "README.md").read_text()
+    (tmp_path / "loop.c").write_text(re.search(r"```c\n(.*?)```", text, re.DOTALL)[1])
+    line = re.search(r"^cc (.*) loop\.c libpcr\.a -lm -o loop$", text, re.MULTILINE)[1].split()
+    words = [CC, *line, "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only", str(tmp_path / "loop.c")]
+    done = subprocess.run(words, cwd=lemniscate, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_no_compiler_warns_of_the_runtime(compiler, each):

@@ -6,6 +6,8 @@
 #ifndef PCR_H
 #define PCR_H
 
+#include <stddef.h>
+
 #include "pcr_config.h"
 #include "pcr_limited.h"
 #include "pcr_qp.h"
