@@ -49,7 +49,8 @@ def _run(options: argparse.Namespace) -> int:
         with leaving_no_empty_folders():
             status: int = command(options)
         sys.stdout.flush()
-        interrupt.check()
+        if not status:  # else the command has said what there is to say
+            interrupt.check()
         return status
     except BrokenPipeError:
         raise

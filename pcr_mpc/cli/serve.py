@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from .. import interrupt
 from ..control.tuning import load_tuning
 from ..errors import OutputError
 from ..files import results, saved
@@ -27,14 +28,17 @@ def _scene(options: argparse.Namespace) -> Scene:
 def serve(options: argparse.Namespace) -> int:
     """Run `pcr-mpc serve`."""
     from ..wire.decider import make_decider
-    from ..wire.server import Server
+    from ..wire.server import Server, require_address
 
     host, colon, port = options.listen.rpartition(":")
     if not (colon and port.isdigit()):
         raise ValueError(f"--listen is {options.listen!r}, expected HOST:PORT such as 127.0.0.1:5005")
+    address = host or "127.0.0.1", int(port)
+    require_address(address, anywhere=options.anywhere)  # before anything that takes long
     scene = _scene(options)
     decider = make_decider(scene, generated=options.generated)
-    server = Server(decider, (host or "127.0.0.1", int(port)), silence=options.silence, anywhere=options.anywhere)
+    server = Server(decider, address, silence=options.silence, anywhere=options.anywhere)
+    status = 0
 
     def tell(text: str) -> None:
         print(f"{scene.name}: {text}", file=sys.stderr, flush=True)
@@ -45,15 +49,16 @@ def serve(options: argparse.Namespace) -> int:
             "Ctrl-C ends it"
         )
         server.serve(tell)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # the way out that `tell` names
         tell("ended")
+        status = interrupt.exit_status()
     finally:
         server.close()
         if options.json:
             print(json.dumps({"scene": scene.name, "address": list(server.address), **server.counts}))
         else:
             tell(", ".join(f"{count} {name}" for name, count in server.counts.items()) or "no packet came")
-    return 0
+    return status
 
 
 def hil(options: argparse.Namespace) -> int:

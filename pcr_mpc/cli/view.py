@@ -10,6 +10,7 @@ import threading
 import webbrowser
 from pathlib import Path
 
+from .. import interrupt
 from ..control.tuning import Tuning, load_tuning
 from ..files import require_free
 from ..loop.controller.own_controller import OwnController
@@ -41,13 +42,15 @@ def view(options: argparse.Namespace) -> int:
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
 
     print(f"{scene.name}: getting ready", file=sys.stderr, flush=True)
+    status = 0
     try:
         server.serve(tell)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # the way out that `tell` names
         print(f"{scene.name}: ended", file=sys.stderr)
+        status = interrupt.exit_status()
     if options.json:
         print(json.dumps({"scene": scene.name, **server.counts}))
-    return 0
+    return status
 
 
 def _has_screen() -> bool:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hmac
+import socket
 from http import HTTPStatus
 from ipaddress import ip_address
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
+from ..errors import OutputError
 from .page import page
 
 if TYPE_CHECKING:
@@ -70,3 +72,25 @@ def answer(connection: ServerConnection, request: Request) -> Response:
     for name, value in _HEADERS.items():
         found.headers[name] = value
     return found
+
+
+def require_address(address: tuple[str, int]) -> None:
+    """Raise if it cannot be listened on now: what is to be served may take long to make.
+
+    Raises
+    ------
+    OutputError
+    """
+    try:
+        for family, kind, _, _, where in socket.getaddrinfo(*address, type=socket.SOCK_STREAM):
+            with socket.socket(family, kind) as bound:
+                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                bound.bind(where)
+    except OSError as error:
+        raise cannot_listen(address, error) from None
+
+
+def cannot_listen(address: tuple[str, int], error: OSError) -> OutputError:
+    """Error that says why, and what to do."""
+    where = "{}:{}".format(*address)
+    return OutputError(f"cannot listen on {where}: {error}; give another --port", path=where)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import interrupt
 from ..compiled import cache_folder
 from ..errors import PCRError
 from ..files import write_text
@@ -64,7 +65,8 @@ class Scenery:
                 context = multiprocessing.get_context("spawn")
                 self._ours, theirs = context.Pipe()
                 self._process = context.Process(target=_work, args=(theirs,), daemon=True)
-                self._process.start()
+                with interrupt.held_back():  # until it follows the parent
+                    self._process.start()
                 theirs.close()
             try:
                 self._ours.send((task, arguments))

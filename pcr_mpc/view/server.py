@@ -19,7 +19,7 @@ from .. import interrupt
 from ..errors import OutputError, PCRError
 from ..plant.robot import Robot
 from .commands import LONGEST, MessageError, read
-from .door import answer, is_loopback, is_socket, refusal
+from .door import answer, cannot_listen, is_loopback, is_socket, refusal, require_address
 from .pages import Page, quiet, text_of
 from .runner import Runner
 from .scenery import Scenery
@@ -98,11 +98,14 @@ class ViewServer:
 
         Raises
         ------
+        OutputError
+            The address cannot be listened on.
         PCRError, ValueError
             The session could not be made, or failed.
         KeyboardInterrupt
             On Ctrl-C.
         """
+        require_address(self.address)
         # Ghosts, which are asked for, do not wait for the workspace.
         self._behind, self._other = Scenery(), Scenery()
         before = sys.getswitchinterval()
@@ -146,8 +149,7 @@ class ViewServer:
                 finally:
                     ghosts.cancel()
         except OSError as error:
-            where = "{}:{}".format(*self.address)
-            raise OutputError(f"cannot listen on {where}: {error}; give another --port", path=where) from None
+            raise cannot_listen(self.address, error) from None
         finally:
             self._over = True
             self._end_scenery()

@@ -23,6 +23,7 @@ from ..errors import PCRError, SimulationError
 from ..loop.controller.make_controller import make_controller
 from ..loop.run.simulate import simulate
 from ..loop.scene.scene import Scene
+from ..study.episodes.parallel import follow_the_parent
 from .hardware import Hardware
 from .packet import RESTING, command_size, pack_measurement, unpack_command
 
@@ -121,7 +122,8 @@ def run_hil(scene: Scene, *, generated: bool = False, progress: bool = False) ->
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_controller, args=(scene, generated, theirs), daemon=True)
-    process.start()
+    with interrupt.held_back():  # until it follows the parent
+        process.start()
     try:
         # As long as it takes: C of a long scene is generated and compiled.
         address = _expected(ours, process, math.inf)
@@ -175,6 +177,7 @@ def _controller(scene: Scene, generated: bool, pipe: Connection) -> None:
     from .decider import make_decider
     from .server import Server
 
+    follow_the_parent()
     # A process that is kept waiting by others, a tenth of a second now and then, has not fallen silent.
     silence = max(_SILENCE, math.ceil(_SILENCE_TIME / scene.period))
     try:

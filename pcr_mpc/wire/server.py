@@ -18,6 +18,35 @@ _AT_REST = 1e-12  # rad/s
 _QUEUE = 100  # datagrams that are read at once
 
 
+def require_address(address: tuple[str, int], *, anywhere: bool = False) -> None:
+    """Raise if a server could not listen there now, or is not to: what it needs else may take long to make.
+
+    Raises
+    ------
+    OutputError
+        The address cannot be listened on, or is none of loopback.
+    """
+    _bound(address, anywhere=anywhere).close()
+
+
+def _bound(address: tuple[str, int], *, anywhere: bool) -> socket.socket:
+    host, port = address
+    try:
+        loopback = ip_address(socket.gethostbyname(host)).is_loopback
+        if not (loopback or anywhere):
+            raise OutputError(f"{host} is no loopback address: whoever can send there moves the motors; "
+                              "if that is meant, say --anywhere", path=host)  # fmt: skip
+        bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            bound.bind((host, port))
+        except BaseException:
+            bound.close()
+            raise
+        return bound
+    except (OSError, OverflowError) as error:
+        raise OutputError(f"cannot listen on {host}:{port}: {error}", path=f"{host}:{port}") from None
+
+
 class Server:
     """Answers each measurement with a command, and nothing else with anything.
 
@@ -56,16 +85,7 @@ class Server:
     def __init__(
         self, decider: Decider, address: tuple[str, int], *, silence: int = 5, anywhere: bool = False
     ) -> None:  # fmt: skip
-        host, port = address
-        try:
-            loopback = ip_address(socket.gethostbyname(host)).is_loopback
-            if not (loopback or anywhere):
-                raise OutputError(f"{host} is no loopback address: whoever can send there moves the motors; "
-                                  "if that is meant, say --anywhere", path=host)  # fmt: skip
-            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._socket.bind((host, port))
-        except (OSError, OverflowError) as error:
-            raise OutputError(f"cannot listen on {host}:{port}: {error}", path=f"{host}:{port}") from None
+        self._socket = _bound(address, anywhere=anywhere)
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
         self.counts: Counter[str] = Counter()
         self.problem = ""

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pcr_mpc.cli import main
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.errors import OutputError, PCRError
 from pcr_mpc.loop.hardware.motors import Motors
@@ -165,6 +166,15 @@ def test_only_loopback_is_listened_on_unless_told_otherwise():
     with pytest.raises(OutputError, match="--anywhere"):
         Server(Echo(), ("0.0.0.0", 0))
     Server(Echo(), ("0.0.0.0", 0), anywhere=True).close()
+
+
+def test_an_address_is_refused_before_anything_is_made(monkeypatch, capsys):
+    monkeypatch.setattr("pcr_mpc.wire.decider.make_decider", lambda *_, **__: pytest.fail("a controller was made"))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        for address, said in (("8.8.8.8:1", "--anywhere"), (f"127.0.0.1:{taken.getsockname()[1]}", "cannot listen on")):
+            assert main(["serve", "lemniscate", "--generated", "--listen", address]) == 1
+            assert said in capsys.readouterr().err
 
 
 def test_the_loop_over_a_socket(server):

@@ -1,5 +1,9 @@
 """What stands behind the robot: the cached workspace, and ghosts that are followed."""
 
+import os
+import signal
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -85,10 +89,17 @@ def test_ghosts_are_equilibria_and_followed_as_the_motors_turn(scene):
 
 
 def test_the_other_process_ends_when_it_is_told(scene, cache):
-    asked = Scenery()
+    asked, found = Scenery(), []
     robot = load_scene(shipped("three_rods"))
-    assert "problem" in asked.workspace(robot.start())
+    asking = threading.Thread(target=lambda: found.append(asked.workspace(robot.start())))
+    asking.start()
+    while asked._process is None or asked._process.pid is None:
+        time.sleep(1e-3)
     process = asked._process
+    while asking.is_alive():  # Ctrl-C in a terminal reaches it too, while it loads and later
+        os.kill(process.pid, signal.SIGINT)
+        asking.join(0.02)
+    assert "two plain rods" in found[0]["problem"]
     assert process.is_alive()
     asked.end()
     assert not process.is_alive()

@@ -298,6 +298,7 @@ def test_the_command_prints_the_address_and_ends_by_ctrl_c_with_nothing_left(tmp
     assert process.returncode == 130  # as all that is stopped by Ctrl-C
     assert json.loads(out)["scene"] == "lemniscate"
     assert "Traceback" not in err
+    assert err.splitlines()[-1] == "lemniscate: ended"  # the way out that was named is no failure
     assert "Warning" not in err
     with pytest.raises(ConnectionRefusedError):
         get(host, int(port), "/")
@@ -306,8 +307,7 @@ def test_the_command_prints_the_address_and_ends_by_ctrl_c_with_nothing_left(tmp
 def test_a_port_that_is_none_or_taken_is_said(served):
     with pytest.raises(OutputError, match="65535"):
         ViewServer(lambda: None, ("127.0.0.1", 65536), Path())
-    scene = load_scene(Path("models/scenes/release.toml"))
-    second = ViewServer(lambda: Session(scene), served.server.address, Path())
+    second = ViewServer(lambda: pytest.fail("a robot was made"), served.server.address, Path())
     with pytest.raises(OutputError, match="--port"):
         second.serve(lambda _: None)
 
