@@ -9,7 +9,6 @@ import os
 import sys
 import traceback
 import warnings
-from pathlib import Path
 
 from .. import interrupt
 from ..files import leaving_no_empty_folders
@@ -27,9 +26,10 @@ _FILES = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status: 1 for a failure, 130 for Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else arguments
     with interrupt.listening(to_the_end=arguments is None):
         try:
-            status = _run(parser().parse_args(arguments))
+            status = _run(parser().parse_args(given), given)
             sys.stdout.flush()
             return status
         except BrokenPipeError:  # of `pcr-mpc ... | head`: nobody reads on, which is no failure to report
@@ -39,10 +39,10 @@ def main(arguments: list[str] | None = None) -> int:
             return 128 + 13  # SIGPIPE
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, given: list[str]) -> int:
     try:
         warnings.formatwarning = lambda message, *_, **__: f"pcr-mpc: warning: {message}\n"
-        _check(options)
+        _check(options, given)
         with interrupt.nothing_to_lose():
             module, name = options.run
             command = getattr(importlib.import_module(f"{__package__}.{module}"), name)
@@ -64,8 +64,14 @@ def _run(options: argparse.Namespace) -> int:
         return interrupt.exit_status() if stopped else 1
 
 
-def _check(options: argparse.Namespace) -> None:
+def _check(options: argparse.Namespace, given: list[str]) -> None:
     """Find the commonest errors before anything that takes time is loaded."""
+    for before, one in zip(["", *given], given, strict=False):
+        # As of a shell's variable that is not set: as a path it would be the folder one is in.
+        if not one.strip() or (one.startswith("--") and one.endswith("=")):
+            before = before if before.startswith("--") else f"an argument of {options.command}"
+            what = one.strip().rstrip("=") or before
+            raise ValueError(f"{what} is empty; give a name")
     for name, least in LEAST.items():
         if (value := getattr(options, name, None)) is not None and value < least:
             raise ValueError(f"--{name} is {value}, expected at least {least}")
@@ -76,28 +82,15 @@ def _check(options: argparse.Namespace) -> None:
     if ending and options.out is not None and options.out.suffix.lower() != ending:
         raise ValueError(f"--out is {options.out}, expected a name that ends with {ending}")
     with interrupt.nothing_to_lose():
-        from ..toml_table import read_toml
+        from .finding import found
 
         options.named = []
         for name, kinds in _FILES.items():
-            given = getattr(options, name, None)
-            if given and not (name == "controller" and isinstance(given, str)):  # else the name of a class
-                path, by_name = _found(str(given), kinds)
-                read_toml(path)
+            wanted = getattr(options, name, None)
+            if wanted and not (name == "controller" and isinstance(wanted, str)):  # else the name of a class
+                path, by_name = found(str(wanted), kinds, options.command)
                 setattr(options, name, path)
                 options.named += [name] if by_name else []
-
-
-def _found(given: str, kinds: tuple[str, ...]) -> tuple[Path, bool]:
-    """File that is meant by a path or a name, and whether it is by a name that it comes with the package."""
-    from ..catalogue import is_name, kinds_of, nearest, shipped
-
-    if not is_name(given):
-        return Path(given), False
-    kind = next((one for one in kinds_of(given) if one in kinds), None)
-    if kind is None and Path(given).is_file():
-        return Path(given), False
-    return shipped(given, kind or next((one for one in kinds if nearest(given, one)), kinds[0])), True
 
 
 def _message(error: BaseException, stopped: bool, options: argparse.Namespace) -> str:

@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=text, description=text)
         # Python 3.14's pattern; before, argparse takes -1e-2 for an option.
         sub._negative_number_matcher = re.compile(r"-\.?\d")
-        sub.set_defaults(run=(module, run))
+        sub.set_defaults(run=(module, run), command=name)
         sub.add_argument("--json", action="store_true", help="print one JSON object on stdout instead of tables")
         sub.add_argument("--traceback", action="store_true", help="show the traceback of a failure")
         # The force of `statics` is one in newtons.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import os
 import sys
@@ -60,6 +61,8 @@ def _has_screen() -> bool:
 
 def replay(options: argparse.Namespace) -> int:
     """Run `pcr-mpc replay`."""
+    if not options.record.exists():
+        raise FileNotFoundError(errno.ENOENT, "", str(options.record))
     folder = options.record if options.record.is_dir() else options.record.parent
     out = options.out or folder / "replay.html"
     require_free(out, force=options.overwrite)

@@ -125,7 +125,7 @@ def test_a_folder_is_named_as_one(files, capsys):
     with pytest.raises(ModelError, match=r"models: is a folder, expected a file$"):
         load_robot(files / "models")
     assert main(["statics", str(files / "models"), "--q", "1", "2"]) == 1
-    assert capsys.readouterr().err == f"pcr-mpc: {files / 'models'}: is a folder, expected a file\n"
+    assert capsys.readouterr().err == f"pcr-mpc: {files / 'models'}: is a folder, and statics takes a robot\n"
 
 
 @pytest.mark.parametrize("command", ["track", "timing"])
