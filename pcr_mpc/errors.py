@@ -129,6 +129,11 @@ _ADVICE: dict[type[OSError], str] = {
 }
 
 
+def cause(error: PCRError) -> str:
+    """What happened, without the next step, which a message sets off by a semicolon: for one that has its own."""
+    return str(error).partition("; ")[0]
+
+
 def checked_integer(name: str, value: Any, *, minimum: int = 1) -> int:
     """Return ``value`` as an int of at least ``minimum``, NumPy's integers too, or say what it is instead.
 

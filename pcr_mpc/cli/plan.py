@@ -7,14 +7,17 @@ import json
 import math
 import time
 from pathlib import Path
+from typing import Any
 
 from ..design.examination import moving_mass
-from ..errors import OutputError
+from ..errors import OutputError, PCRError, cause
 from ..files import require_free, saved, stamped, write_text
 from ..loop.scene.file import load_scene
-from ..report.plan_table import plan_table
+from ..loop.scene.scene import Scene
+from ..report.plan_table import LIGHT, plan_table
 from ..study.planning.limits import PlanLimits
-from ..study.planning.plan import plan_timing
+from ..study.planning.plan import plan_timing, rods_left_out
+from ..study.planning.timed_path import TimedPath
 from ..toml_table import seen_from
 
 
@@ -40,8 +43,10 @@ def plan(options: argparse.Namespace) -> int:
         free=options.free,
         progress=True,
     )
-    share = moving_mass(scene.start())[1]
-    summary = planned.summary() | {"share_of_rods": share, "planning_s": time.perf_counter() - begin}
+    summary = planned.summary() | {"planning_s": time.perf_counter() - begin}
+    summary |= {"share_of_rods": moving_mass(scene.start())[1]}
+    if planned.rods is None and summary["share_of_rods"] > LIGHT:
+        summary["rods_left_out"] = _left_out(scene, planned)
 
     def write(folder: Path) -> None:
         write_text(folder / out.name, stamped(planned.csv()))
@@ -60,6 +65,14 @@ def plan(options: argparse.Namespace) -> int:
     if problem:
         raise OutputError(problem, path=str(folder))
     return 0
+
+
+def _left_out(scene: Scene, planned: TimedPath) -> dict[str, Any]:
+    """What to expect where the rods have their mass."""
+    try:
+        return rods_left_out(scene, planned).summary()
+    except PCRError as error:
+        return {"error": cause(error)}
 
 
 def _use(options: argparse.Namespace, file: Path) -> str:

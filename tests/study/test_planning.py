@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import (
+    Blended,
     ConvergenceError,
     InfeasibleError,
     Line,
@@ -18,6 +19,7 @@ from pcr_mpc import (
     Spline,
     UnreachableError,
     UnstableError,
+    Waypoints,
     check_scene,
     inverse_statics,
     load_path,
@@ -28,16 +30,20 @@ from pcr_mpc import (
 )
 from pcr_mpc.cli import main
 from pcr_mpc.linearisation.pose_limits import PoseLimits
+from pcr_mpc.loop.references.tabulated import Tabulated
 from pcr_mpc.loop.references.trajectory import PickAndPlace, smooth_step
 from pcr_mpc.report.plan_table import plan_table
+from pcr_mpc.study.planning import rods_mass
 from pcr_mpc.study.planning.course import paced
 from pcr_mpc.study.planning.free import way_points
 from pcr_mpc.study.planning.meshing import points
 from pcr_mpc.study.planning.motion import Carrier
 from pcr_mpc.study.planning.pace import constant_pace, spline_of
 from pcr_mpc.study.planning.path import path_of
+from pcr_mpc.study.planning.plan import rods_left_out
 from pcr_mpc.study.planning.timing import Problem, evaluated
 from tests.conftest import MODELS
+from tests.references.drawn import rows
 
 NO_MOTORS = {"rate": 1e6, "acceleration": 1e12, "torque": 1e3}
 
@@ -317,6 +323,41 @@ def test_a_free_path_keeps_every_limit(scene, limit, value):
     assert share["motor torque" if limit == "torque" else limit.replace("_", " ")] > 0.98
 
 
+def test_limits_are_lowered_until_with_the_rods_mass_none_is_exceeded_by_anything(scene, planned, monkeypatch):
+    """A motor that is asked for half a thousandth too much is one that `check_scene` refuses."""
+    model = replace(scene.tuning.model, inertia="condensed")
+    heavy, limits = replace(scene, tuning=replace(scene.tuning, model=model)), PlanLimits.of_scene(scene)
+    kept = []
+
+    def asked(*_):
+        share = 1.0005 * kept[-1].acceleration / limits.acceleration
+        return {"rate": 1.0, "acceleration": share * limits.acceleration, "torque": 0.1}
+
+    monkeypatch.setattr(rods_mass, "asked_of_motors", asked)
+    found = rods_mass.with_rods(heavy, limits, 0.0, lambda lowered: kept.append(lowered) or planned)
+    assert len(kept) == found.rods.rounds == 2
+    assert found.rods.acceleration <= limits.acceleration
+
+
+@pytest.mark.parametrize(
+    ("excess", "words"),
+    [(-5e-4, "limits kept, 99.950 %"), (4e-5, "limits kept to 0.1 %, 100.004 %"), (2e-3, "limits exceeded: 100.200 %")],
+)
+def test_limits_are_said_to_be_kept_or_not_and_never_both(planned, excess, words):
+    """Whatever is left or beyond is a share of the limit that is used."""
+    assert f"{words} of one at most" in plan_table(planned.summary() | {"largest_excess": excess})
+
+
+def test_a_rough_path_is_told_from_one_with_a_corner(scene):
+    t, points = rows()
+    rough = Tabulated(t, points)
+    with pytest.raises(ModelError, match=rf"rough.* scatter by about .* smoothing = {rough.scatter:.2g}$"):
+        path_of(Blended(rough), t[-1], 5e-5)
+    path_of(Blended(replace(rough, smoothing=rough.scatter)), t[-1], 5e-5)
+    with pytest.raises(ModelError, match=r"round the corner, or allow more \(--tolerance, tolerance\)$"):
+        path_of(Waypoints(((0.0, 0.2), (0.1, 0.2), (0.1, 0.3)), speed=0.1), 4.0, 5e-5)
+
+
 @pytest.mark.slow
 def test_a_plan_reckons_with_the_rods_inertia_that_the_controller_knows(scene):
     """Of rods three times as heavy: where a plan without it asks for too much, one with it does not, and is slower."""
@@ -330,7 +371,9 @@ def test_a_plan_reckons_with_the_rods_inertia_that_the_controller_knows(scene):
 
     light = plan_timing(replace(heavy, tuning=scene.tuning), cells=40)
     assert light.rods is None
-    assert any("change its rate by" in line for line in check_scene(tracked(light)))
+    (line,) = (line for line in check_scene(tracked(light)) if "change its rate by" in line)
+    left_out = rods_left_out(replace(heavy, tuning=scene.tuning), light)
+    assert f"change its rate by {left_out.acceleration:.4g} rad" in line.replace("by -", "by ")
     planned = plan_timing(heavy, cells=40)
     assert check_scene(tracked(planned)) == []
     assert light.duration < planned.duration < 1.3 * light.duration
@@ -430,7 +473,12 @@ def test_the_command_writes_a_path_and_a_picture(tmp_path, capsys):
     assert found["top_speed_m_s"] == pytest.approx(0.5, rel=2e-3)
     # Two rods of 5.6 g beside 250 g: less than all of them, for they are clamped at one end.
     assert 0.005 < found["share_of_rods"] < 11.1 / 261.1
-    assert "38 % of the mass that moves, left out" in plan_table(found | {"share_of_rods": 0.38})
+    left_out = {"asked": dict.fromkeys(("rate_rad_s", "rate_change_rad_s2", "torque_Nm"), 2.0)}
+    left_out["limits"] = dict.fromkeys(left_out["asked"], 1.5)
+    told = plan_table(found | {"share_of_rods": 0.38, "rods_left_out": left_out})
+    assert "38 % of the mass that moves, left out" in told
+    assert "with it the motors are asked for 2 of 1.5 rad/s, " in told
+    assert "limits kept by rods without mass" in told
     assert {row["limit"] for row in found["limits"]} >= {"motor rate", "change of rate", "tip speed"}
     assert (tmp_path / "fast.png").stat().st_size > 10_000
     out.write_text("mine")

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 
 from ... import interrupt
 from ...control.qp import Reference
-from ...errors import ConvergenceError, PCRError
+from ...errors import ConvergenceError, PCRError, cause
 from ...frozen import Frozen
 from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
@@ -224,9 +224,10 @@ def _explained(
     share = low or high
     slower = math.ceil(10.0 / math.sqrt(share)) / 10.0
     return type(error)(
-        f"reference at t = {t[k]:.3f} s: it asks for an acceleration of {math.hypot(*accelerations[k]):.3g} m/s^2, and "
-        f"the rods, which could rest there and everywhere on it, can give {100 * share:.0f} % of the force that its "
-        f"motion takes; smooth it, or make it slower by a factor of at least {slower:g}: {error}",
+        f"reference at t = {t[k]:.3f} s: it asks for an acceleration of {math.hypot(*accelerations[k]):.3g} m/s^2, for "
+        f"which {cause(error)}. The rods could rest there and everywhere on it, and can give {100 * share:.0f} % of "
+        f"the force that its motion takes; smooth it, or make it slower by a factor of at least {slower:g} "
+        "(time_scale)",
         **error.details,
     )
 

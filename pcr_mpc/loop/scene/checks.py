@@ -10,10 +10,13 @@ import numpy as np
 from ...errors import ModelError, UnreachableError, check_numbers, checked_vector
 from ...files import name_problem
 from ...plant.robot import Robot
-from ..references.trajectory import sampled
+from ..references.blended import Blended
+from ..references.tabulated import Tabulated
+from ..references.trajectory import Trajectory, sampled
 
 LATE = ("hold", "shifted_plan")
-_MILLIMETRES = 10.0  # times too far, from which a reference may be in other units
+_FAR = 3.0  # rod lengths out of reach, from which a place may be in other units
+_UNITS = {"millimetres": 1e3, "centimetres": 1e2}  # in a metre
 
 
 def is_multiple(value: float, of: float) -> bool:
@@ -76,11 +79,13 @@ def require_within_stops(scene: Any) -> None:
 
 def require_reach(scene: Any) -> None:
     """Raise if a rod is too short for the start or for the reference, which costs no statics to see."""
-    if scene.start_tip is not None:
+    # A start that follows from the reference is the reference's to blame.
+    begins = None if scene.trajectory is None else sampled(scene.trajectory, np.zeros(1))[0, 0]
+    if scene.start_tip is not None and (begins is None or not np.array_equal(begins, scene.start_tip)):
         try:
             scene.robot.require_reachable(np.array(scene.start_tip))
         except UnreachableError as error:
-            units = _units_hint(error.distance - error.length, scene.robot)
+            units = _units_hint(np.array([scene.start_tip]), scene.robot)
             raise ModelError(f"{scene.name}: start.tip: {error}{units}", key="start.tip", **error.details) from None
     if scene.trajectory is None:
         return
@@ -97,13 +102,29 @@ def require_reach(scene: Any) -> None:
     except UnreachableError as error:
         worst = f"; at t = {t[farthest[0]]:.3f} s rod {farthest[1]} is {1e3 * most:.4g} mm too short"
         raise ModelError(
-            f"{scene.name}: reference at t = {t[first]:.3f} s: {error}{worst if most > 0 else ''}"
-            f"{_units_hint(most, robot)}",
+            f"{scene.name}: reference at t = {t[first]:.3f} s{_row(scene.trajectory, tips[first])}: {error}"
+            f"{worst if most > 0 else ''}{_units_hint(tips, robot)}",
             key="reference",
             t=float(t[first]),
             **error.details,
         ) from None
 
 
-def _units_hint(short: float, robot: Robot) -> str:
-    return "; is it in millimetres?" if short > _MILLIMETRES * float(robot.lengths.max()) else ""
+def _row(trajectory: Trajectory, p: np.ndarray) -> str:
+    """Which row of a path of rows a place is at, counted as in its file."""
+    path = trajectory.path if isinstance(trajectory, Blended) else trajectory
+    if not isinstance(path, Tabulated):
+        return ""
+    return f" (at row {1 + int(np.linalg.norm(np.array(path.points) - p, axis=1).argmin())} of its file)"
+
+
+def _units_hint(tips: np.ndarray, robot: Robot) -> str:
+    """In what units tips that are far out of reach would all be within it."""
+
+    def beyond(tips: np.ndarray) -> float:
+        return float((np.linalg.norm(tips[:, None] - robot.bases, axis=2) - robot.lengths).max())
+
+    if beyond(tips) <= _FAR * float(robot.lengths.max()):
+        return ""
+    fit = [name for name, many in _UNITS.items() if beyond(tips / many) < 0.0]
+    return f"; is it in {' or '.join(fit or ['other units'])}?"

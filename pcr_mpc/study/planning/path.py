@@ -12,8 +12,10 @@ from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.sparse.linalg import splu
 
-from ...errors import ModelError, checked_array
+from ...errors import ModelError, cause, checked_array
 from ...frozen import Frozen
+from ...loop.references.blended import Blended
+from ...loop.references.tabulated import Tabulated
 from ...loop.references.trajectory import Trajectory, sampled
 
 _DEGREE = 7  # a motor's acceleration holds the fourth derivative, which is to have no kinks
@@ -64,7 +66,19 @@ def path_of(trajectory: Trajectory, duration: float, tolerance: float) -> TipPat
     ModelError
         The tip does not move, or the path has a corner.
     """
-    return path_through(sampled(trajectory, np.linspace(0.0, duration, _SAMPLES))[:, 0], tolerance)
+    try:
+        return path_through(sampled(trajectory, np.linspace(0.0, duration, _SAMPLES))[:, 0], tolerance)
+    except ModelError as error:
+        rows = trajectory.path if isinstance(trajectory, Blended) else trajectory
+        if not isinstance(rows, Tabulated) or "deviation" not in error.details:
+            raise
+        said = (
+            f"{cause(error)}, and the rows of the reference scatter by about {1e3 * rows.scatter:.2g} mm; if that is "
+            f"noise, say so in [reference]: smoothing = {rows.scatter:.2g}"
+            if rows.scatter
+            else f"{error}, or take more smoothing of the rows than {rows.smoothing:g} m"
+        )
+        raise ModelError(said, **error.details) from None
 
 
 def path_through(points: np.ndarray, tolerance: float) -> TipPath:
@@ -93,8 +107,9 @@ def path_through(points: np.ndarray, tolerance: float) -> TipPath:
     if away[at] <= tolerance:
         return TipPath(spline, float(s[-1]), float(away[at]))
     raise ModelError(
-        f"the path has a corner: its smooth spline is still {1e3 * away[at]:.3g} mm away at p = {points[at]} m, "
-        f"{1e3 * s[at]:.4g} mm along, where {1e3 * tolerance:.3g} mm are allowed; round the corner, or allow more",
+        f"the path has a corner or is rough: its smooth spline is still {1e3 * away[at]:.3g} mm away at p = "
+        f"{points[at]} m, {1e3 * s[at]:.4g} mm along, where {1e3 * tolerance:.3g} mm are allowed; round the corner, or "
+        "allow more (--tolerance, tolerance)",
         key="reference",
         deviation=float(away[at]),
         s=float(s[at]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from tqdm import tqdm
@@ -18,9 +19,9 @@ from .meshing import FINE, points, repaced, with_points
 from .motion import Carrier
 from .pace import cells_of, spline_of, times
 from .path import TipPath, path_of
-from .rods_mass import with_rods
+from .rods_mass import asked_of_motors, with_rods
 from .starting import STATICS, evened, started, where
-from .timed_path import Paced, TimedPath
+from .timed_path import Paced, RodsMass, TimedPath
 from .timing import Problem, Timing
 
 _CELL = 1e-2  # s
@@ -96,8 +97,7 @@ def plan_timing(
     checked_number("tolerance", tolerance, above=0.0)
     limits = PlanLimits.of_scene(scene) if limits is None else limits
     points_between = way_points(scene.trajectory) if free else np.empty((0, 2))
-    own = getattr(scene.trajectory, "duration", math.inf)
-    span = own if math.isfinite(own) else scene.duration
+    span = _span(scene)
     path = path_of(scene.trajectory, span, tolerance)
     carrier = carrier_of(scene, span)
     with tqdm(disable=not progress, unit=" iterations", desc="planning", leave=False) as bar:
@@ -112,6 +112,27 @@ def plan_timing(
             return _planned(scene.name, problem, path, cells, points_between if free else None, told)
 
         return with_rods(scene, limits, carrier.mass - scene.robot.tip_mass, planned_for)
+
+
+def rods_left_out(scene: Scene, planned: TimedPath) -> RodsMass:
+    """What a plan asks of the motors where the rods have the mass that it leaves out.
+
+    Raises
+    ------
+    PCRError
+        With it the motors cannot follow at all.
+    """
+    assert scene.tuning is not None
+    inertia = "condensed"
+    knowing = replace(scene, tuning=replace(scene.tuning, model=replace(scene.tuning.model, inertia=inertia)))
+    carried = carrier_of(scene, _span(scene)).mass - scene.robot.tip_mass
+    return RodsMass(inertia, planned.limits, **asked_of_motors(knowing, planned, carried), rounds=1)
+
+
+def _span(scene: Scene) -> float:
+    """Time that the reference takes [s]."""
+    own = getattr(scene.trajectory, "duration", math.inf)
+    return own if math.isfinite(own) else scene.duration
 
 
 def _planned(

@@ -13,9 +13,8 @@ from .limits import PlanLimits
 from .timed_path import RodsMass, TimedPath
 
 _KINDS = {"rate": "rate_rad_s", "acceleration": "rate_change_rad_s2", "torque": "torque_Nm"}
-_EXCESS = 1e-3  # of a limit, that is none
 _ROUNDS = 8
-_SPARE = 2e-4  # by which a limit is lowered more than it must be
+_SPARE = 5e-4  # by which a limit is lowered more than it must be
 _REST = 5  # periods
 
 
@@ -47,9 +46,9 @@ def with_rods(
         planned = planned_for(lowered)
         if inertia == "none":
             return planned
-        asked = _asked(scene, planned, carried)
+        asked = asked_of_motors(scene, planned, carried)
         shares = {kind: value / getattr(limits, kind) for kind, value in asked.items()}
-        if max(shares.values()) <= 1.0 + _EXCESS:
+        if max(shares.values()) <= 1.0:  # what is beyond by however little, `check_scene` refuses
             return replace(planned, rods=RodsMass(inertia, limits, **asked, rounds=rounds))
         lowered = replace(
             lowered,
@@ -65,8 +64,8 @@ def with_rods(
     )
 
 
-def _asked(scene: Scene, planned: TimedPath, carried: float) -> dict[str, float]:
-    """Of the motors at most, with the rods' inertia."""
+def asked_of_motors(scene: Scene, planned: TimedPath, carried: float) -> dict[str, float]:
+    """Largest rate, change of rate and torque of any motor with the inertia that the scene's controller knows."""
     robot = scene.robot
     count = math.ceil(planned.duration / scene.period) + _REST
     loaded = replace(
