@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..design.examination import Examination, examine
-from ..design.remarks import Remark
+from ..design.remarks import Remark, about_wish
 from ..design.sizing import Design, design
 from ..design.toml_text import files
 from ..design.wish import Wish
@@ -46,7 +46,8 @@ def new(options: argparse.Namespace) -> int:
     chosen = _kept(design(wish))
     for name, text in files(chosen).items():
         write_text(folder / name, text)
-    found = examine(load_scene(folder / "scene.toml"), modes=False)
+    found = examine(load_scene(folder / "scene.toml"), modes=False, upright=wish.upright)
+    found.remarks += about_wish(wish, found.robot)
     written = {name: str(folder / name) for name in _NAMES}
     print(json.dumps(new_record(chosen, found, written)) if options.json else new_table(chosen, found))
     scene = folder / "scene.toml"

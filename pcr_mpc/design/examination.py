@@ -69,7 +69,7 @@ class Examination:
         return [one for one in self.remarks if one.level == "error"]
 
 
-def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
+def examine(what: Robot | Scene, *, modes: bool = True, upright: float | None = None) -> Examination:
     """Examine a robot or a scene; what is wrong with it is a remark, and no exception.
 
     Parameters
@@ -77,6 +77,9 @@ def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
     what : Robot or Scene
     modes : bool
         Whether to look which working modes there are: 2^n searches for n rods.
+    upright : float, optional
+        How many times stiffer the rods are out of the plane than in it, which a robot does not say: 1 if they are
+        round, the square of width over thickness if they are strips.
     """
     scene = what if isinstance(what, Scene) else None
     robot = what.robot if isinstance(what, Scene) else what
@@ -102,7 +105,7 @@ def examine(what: Robot | Scene, *, modes: bool = True) -> Examination:
         steps, remarks = about_steps(scene, mass, found.figures)
         found.figures["steps"] = steps
         found.remarks += remarks
-    found.remarks += about_rods(robot, scene, found.figures)
+    found.remarks += about_rods(robot, scene, found.figures, upright)
     found.remarks += unidentifiable(robot)
     found.remarks.sort(key=lambda one: ("error", "warning", "note").index(one.level))
     return found

@@ -12,7 +12,7 @@ from ..loop.scene.scene import Scene
 from ..plant.motion.step_limit import longest_step
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
-from .wish import rounded
+from .wish import LEAST_MASS, Wish, rounded
 
 NEAR = 0.85  # of a limit, from which it is near
 _FEW_PERIODS = 15.0  # of control in a swing of the tip
@@ -125,8 +125,11 @@ def about_steps(scene: Scene, mass: np.ndarray, figures: dict[str, Any]) -> tupl
     return steps, remarks
 
 
-def about_rods(robot: Robot, scene: Scene | None, figures: dict[str, Any]) -> list[Remark]:
-    """The rods' own mass, what the toolkit's model of them leaves out, and what is not stated."""
+def about_rods(robot: Robot, scene: Scene | None, figures: dict[str, Any], upright: float | None) -> list[Remark]:
+    """The rods' own mass, what the toolkit's model of them leaves out, and what is not stated.
+
+    ``upright`` is how many times stiffer the rods are out of the plane; None where nobody said.
+    """
     remarks = []
     start, reference = figures["start"], figures.get("reference") or {}
     if scene is not None and start["share_of_rods"] > _COUNTS:
@@ -161,19 +164,36 @@ def about_rods(robot: Robot, scene: Scene | None, figures: dict[str, Any]) -> li
             _note("strain", "no strain limit is known: state material and diameter of the rods, and it is watched")
         )
     if not any(robot.gravity):
-        sag = robot.tip_mass * _GRAVITY / (3 * float((robot.stiffnesses / robot.lengths**3).sum()))
+        sag = robot.tip_mass * _GRAVITY / (3 * float((robot.stiffnesses / robot.lengths**3).sum())) / (upright or 1.0)
         shortest = float(robot.lengths.min())
         if sag > _HANGS * shortest:
             far = f"about {1e3 * sag:.0f} mm" if sag < shortest else "their own length or more"
+            rods, more = "its rods let", ""
+            if upright is None:
+                rods = "round rods let"
+                more = ". Upright strips let it sag by that over the square of width over thickness"
             remarks.append(
                 _note(
                     "support",
-                    f"the robot lies flat, and if its rods are round, they let the tip sag out of the plane by {far}: "
-                    "let it slide on a plate, or hang it on a long string. Upright strips are as many times stiffer "
-                    "that way as the square of width over thickness",
+                    f"the robot lies flat, and {rods} the tip sag out of the plane by {far}: let it slide on a plate, "
+                    f"or hang it on a long string{more}",
                 )
             )
     return remarks
+
+
+def about_wish(wish: Wish, robot: Robot) -> list[Remark]:
+    """What was wished and is taken, though it would not have been chosen."""
+    ratio = robot.tip_mass / sum(rod.line_density * rod.length for rod in robot.rods)
+    if wish.tip_mass is None or ratio >= LEAST_MASS:
+        return []
+    return [
+        _note(
+            "tip mass",
+            f"the tip weighs {ratio:.2g} times what its rods weigh, as was wished; {LEAST_MASS:g} times or more is "
+            "chosen where nothing is, so that the rods follow it",
+        )
+    ]
 
 
 def unidentifiable(robot: Robot) -> list[Remark]:

@@ -14,10 +14,9 @@ from ..plant.statics.equilibrium import Equilibrium
 from .layout import Layout
 from .motors import MOTORS, Motor, motor_named
 from .placing import TORQUE_USED, place, refusal
-from .wish import Wish, length_text, rounded
+from .wish import LEAST_MASS, Wish, length_text, rounded
 
 _USUAL_SWING = 0.4  # s, of the tip on its rods: slow enough for any motor, fast enough not to be boring
-_LEAST_MASS = 6.0  # of the tip, in rods: what light rods are
 _SLOWEST_SWING, _FASTEST_SWING = 12.0, 0.02  # s
 _DAMPING = 0.025  # of the tip's swing, relative to critical: that of planar_pair
 _LAPS = 2.0
@@ -87,7 +86,7 @@ def design(wish: Wish) -> Design:
     rods = _mass_of_rods(bare, poses[0])
     softest = float(np.linalg.eigvalsh(stiffness)[0])
     rod_mass = wish.rods * wish.length * bare.rods[0].line_density
-    mass = wish.tip_mass or rounded(max(_LEAST_MASS * rod_mass, softest * (_USUAL_SWING / (2 * math.pi)) ** 2))
+    mass = wish.tip_mass or rounded(max(LEAST_MASS * rod_mass, softest * (_USUAL_SWING / (2 * math.pi)) ** 2))
     moving = mass * np.eye(2) + rods
     inverse = np.linalg.inv(np.linalg.cholesky(moving))
     rates = np.sqrt(np.linalg.eigvalsh(inverse @ stiffness @ inverse.T))

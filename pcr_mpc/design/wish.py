@@ -15,6 +15,7 @@ from ..plant.rod import Rod
 from .layout import Layout
 from .motors import Motor
 
+LEAST_MASS = 6.0  # of the tip that is chosen, in rods: what light rods are
 _MOST_RODS = 4
 _SLENDER = 50.0  # length over diameter from which a rod is a beam that bends and does nothing else
 
@@ -103,6 +104,11 @@ class Wish:
         if self.width is None or self.thickness is None:
             return Section.round(self.diameter)
         return Section.strip(self.width, self.thickness)
+
+    @property
+    def upright(self) -> float:
+        """How many times stiffer the rods are out of the plane of the robot than in it."""
+        return 1.0 if self.width is None or self.thickness is None else (self.width / self.thickness) ** 2
 
     def robot(self, layout: Layout, motor: Motor, tip_mass: float = 1.0, drag: float = 0.0) -> Robot:
         """Robot of these rods."""

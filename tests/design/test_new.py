@@ -1,5 +1,7 @@
 """A robot from a few numbers: written, checked, tracked; refused where it cannot work, with numbers that can."""
 
+import contextlib
+import io
 import json
 import math
 import re
@@ -16,6 +18,7 @@ from pcr_mpc.design.sizing import design
 from pcr_mpc.design.toml_text import files
 from pcr_mpc.design.wish import Wish
 from pcr_mpc.plant.materials import MATERIALS
+from tests.conftest import MODELS
 
 
 def tracked(folder, laps=0.35):
@@ -41,8 +44,23 @@ def written(folder, **numbers):
 def mine(tmp_path_factory):
     """The folder that `new` writes without an option."""
     folder = tmp_path_factory.mktemp("own") / "mine"
-    assert main(["new", str(folder)]) == 0
+    with contextlib.redirect_stdout(io.StringIO()) as told:
+        assert main(["new", str(folder)]) == 0
+    (folder / "told.txt").write_text(told.getvalue())
     return folder
+
+
+def test_the_page_shows_what_is_printed(mine):
+    """Text as it stands, numbers to a digit that rounding may change."""
+    number = re.compile(r"\d+\.?\d*(?:e[+-]\d+)?")
+    page = (MODELS.parent / "docs" / "new_robot.md").read_text().partition("```text\n")[2].partition("```")[0]
+    told = (mine / "told.txt").read_text()
+    assert "round rods" not in told
+    assert "its rods let the tip sag out of the plane" in told
+    told = told.partition("\n\n")[0]
+    assert number.sub("#", page.strip()) == number.sub("#", told.strip())
+    shown, printed = ([float(one) for one in number.findall(text)] for text in (page, told))
+    assert shown == pytest.approx(printed, rel=0.02)
 
 
 def test_it_tracks(mine):
@@ -57,11 +75,15 @@ def test_stiffness_and_density_are_those_of_the_wire(mine):
     assert robot.strain_limits == pytest.approx([MATERIALS["nitinol"].strain_limit] * 2)
 
 
-def test_strips_of_spring_steel(tmp_path):
+def test_strips_of_spring_steel(tmp_path, capsys):
     """12 x 0.4 mm, by hand: E w t^3 / 12, rho w t; and it tracks."""
     folder = tmp_path / "mine"
     words = ["--material", "spring_steel", "--width", "12e-3", "--thickness", "0.4e-3", "--length", "0.42"]
-    assert main(["new", str(folder), *words]) == 0
+    assert main(["new", str(folder), *words, "--tip-mass", "0.1", "--json"]) == 0
+    remarks = {one["about"]: one["text"] for one in json.loads(capsys.readouterr().out)["remarks"]}
+    # Rods of 31.6 g; they are 900 times as stiff out of the plane, where the tip of 0.1 kg sags by less than 1 mm.
+    assert "3.2 times what its rods weigh, as was wished; 6 times" in remarks["tip mass"]
+    assert "support" not in remarks
     robot = load_robot(folder / "robot.toml")
     assert robot.stiffnesses == pytest.approx([206e9 * 12e-3 * 0.4e-3**3 / 12] * 2)
     assert [rod.line_density for rod in robot.rods] == pytest.approx([7850 * 12e-3 * 0.4e-3] * 2)
