@@ -22,7 +22,7 @@ from pcr_mpc.codegen.timing import time_in_c, worst_case
 from pcr_mpc.codegen.vectors import recorded
 from pcr_mpc.control.observer import ObserverTuning
 from pcr_mpc.control.tuning import LearningTuning, load_tuning
-from pcr_mpc.errors import GenerationError, PCRError
+from pcr_mpc.errors import GenerationError, MeasurementError, PCRError
 from pcr_mpc.loop.controller.make_controller import make_controller
 from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.hardware.motors import Motors
@@ -229,6 +229,9 @@ def test_parameters_that_change_while_it_runs_do_what_retune_does(lemniscate, tm
     for controller in (in_c, in_python, as_before):
         controller.start(subject.pose)
     plant, x, changed = scene.make_plant(), np.concatenate([subject.pose.p, [0.0, 0.0], subject.pose.q]), 0.0
+    for controller in (in_c, in_python):  # before it is on its way
+        with pytest.raises(MeasurementError, match="out of reach"):
+            controller.step(0, np.concatenate([1e2 * x[:2], x[2:]]))  # centimetres
     plant.reset(x, subject.pose)
     for k in range(80):
         if k == 20:  # what is refused changes nothing

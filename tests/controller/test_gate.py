@@ -141,6 +141,8 @@ def test_noise_load_and_delay_hide_no_glitch():
         (added(0, 0.05), "cannot be further than"),
         (added(0, np.nan), "not finite"),
         (scaled(slice(0, 2), 1e3), "millimetres"),
+        (scaled(slice(0, 2), 1e2), "out of reach"),  # centimetres
+        (lambda x: x.__setitem__(slice(0, 2), 1e3 * x[:2] + 50.0), "out of reach"),
         (scaled(slice(4, 6), 180 / np.pi), "degrees"),
         (added(4, -2 * np.pi), "wrapped = true"),
         (added(5, -np.inf), "not finite"),

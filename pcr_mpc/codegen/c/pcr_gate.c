@@ -71,7 +71,8 @@ static oddity odd_tip(const pcr_controller *controller, const double *x, const d
         }
         return ODD;
     }
-    if (isfinite(away) && hypot(x[0] / 1e3 - expected[0], x[1] / 1e3 - expected[1]) <= near) {
+    if (isfinite(away) && (hypot(x[0] / 1e3 - expected[0], x[1] / 1e3 - expected[1]) <= near
+                           || too_far(controller, x, TOO_LONG))) {
         return ODD_UNITS;
     }
     return ODD;

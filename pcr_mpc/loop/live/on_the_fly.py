@@ -62,7 +62,7 @@ class OnTheFly(ABC):
         PCRError
             The controller was not started.
         MeasurementError
-            The first measurement is in other units, or its angles are wrapped.
+            The first measurement is out of reach, in other units, or its angles are wrapped.
         ValueError
             Names the argument: it has another shape, or k is no period.
         """

@@ -117,7 +117,8 @@ class Gate:
         Raises
         ------
         MeasurementError
-            The very first measurement is in other units, or wrapped: degrees, millimetres, whole turns off.
+            The very first measurement cannot be: its tip is out of reach, as in millimetres or centimetres, or its
+            angles are degrees or whole turns off.
         """
         found = Sifted()
         told, due = x.tolist(), expected.tolist()  # on a few floats Python is faster than NumPy
@@ -162,7 +163,7 @@ class Gate:
         return found
 
     def _odd_tip(self, x: list[float], expected: list[float], with_velocity: bool) -> tuple[str, bool] | None:
-        """Why a tip is not to be believed, and whether other units explain it."""
+        """Why a tip is not to be believed, and whether other units may explain it."""
         px, py, vx, vy = x[:4]
         ex, ey, evx, evy = expected[:4]
         near = self._near + _TIP_ECHO * self._tip.surprise
@@ -183,7 +184,7 @@ class Gate:
             return f"{text}, expected ({ex:.6g}, {ey:.6g}) m: millimetres? give metres", True
         far = self._too_far(px, py, _TOO_LONG)
         if far:
-            return f"{text} is out of reach: {far}", False
+            return f"{text} is out of reach: {far}", True  # in centimetres, or seen from another place
         return (
             f"{text} is {away:.3g} m from the expected ({ex:.6g}, {ey:.6g}) m, and cannot be further than {near:.3g} m",
             False,
