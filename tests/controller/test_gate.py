@@ -250,6 +250,15 @@ def test_a_first_measurement_in_other_units_is_refused(started, spoil, words):
     assert not controller.step(0, x).events
 
 
+def test_what_was_not_measured_is_said_in_words(started):
+    controller, x = started
+    said = " ".join(event["message"] for event in controller.step(0, np.where(np.arange(6) < 2, np.nan, x)).events)
+    assert "no tip was measured" in said
+    assert "nan" not in said
+    said = " ".join(event["message"] for event in controller.step(1, np.where(np.arange(6) > 3, np.nan, x)).events)
+    assert "no motor angles were measured" in said
+
+
 @pytest.mark.parametrize("wrong", [np.zeros(5), np.zeros(7), np.zeros((2, 3)), 0.25, [[0.0] * 6] * 6, "123456", None])
 def test_shapes_are_checked(started, wrong):
     controller, x = started

@@ -106,6 +106,7 @@ class LiveLoop:
         self._wish = Wish()
         self.notes: list[Event] = []
         self._resting = False
+        self._said: set[str] = set()  # of the measurements in the last period
         self._silent = [0, 0]  # periods in which nothing that the tip's sensor, and the encoders, said was believed
         self._seen: deque[tuple[int, np.ndarray, np.ndarray]] = deque(maxlen=_RETURNED)
         self._last: Decision | None = None
@@ -114,7 +115,7 @@ class LiveLoop:
         """Stand in a pose, or pass it at a velocity of the tip [m/s]; the next call of `step` is for period k."""
         self._clock.start()
         self.k = k - 1
-        self._wish, self.notes, self._resting, self._silent = Wish(), [], False, [0, 0]
+        self._wish, self.notes, self._resting, self._silent, self._said = Wish(), [], False, [0, 0], set()
         self._seen.clear()
         self._last = None
         self._stand(k, found, np.zeros(2) if velocity is None else velocity)
@@ -252,7 +253,13 @@ class LiveLoop:
             notes.append(("rest", f"{who} said nothing believable for {self._sensors.bridge:.3g} s: the motors are "
                           "brought to rest until the robot is seen again"))  # fmt: skip
             self._lose()
-        return replace(decision, events=(*decision.events, *_told(self.k, notes)))
+        return replace(decision, events=self._news((*decision.events, *_told(self.k, notes))))
+
+    def _news(self, events: tuple[dict[str, str], ...]) -> tuple[dict[str, str], ...]:
+        """Events without what was said of a measurement in the last period too, as that a sensor is silent."""
+        texts = [each["message"].partition(": ")[2] if each["kind"] == "measurement" else "" for each in events]
+        before, self._said = self._said, set(texts) - {""}
+        return tuple(each for each, text in zip(events, texts, strict=True) if text not in before)
 
     def _rest(self, reading: tuple[np.ndarray, np.ndarray], notes: list[Event]) -> Decision:
         """Brake and stay; go on when the robot is seen again."""

@@ -178,6 +178,8 @@ class Gate:
                     return None
                 return f"tip velocity ({vx:.6g}, {vy:.6g}) m/s, expected ({evx:.6g}, {evy:.6g}) m/s", False
         text = f"tip ({px:.6g}, {py:.6g}) m"
+        if px != px and py != py:
+            return "no tip was measured", False
         if not math.isfinite(away):
             return f"{text} is not finite", False
         if math.hypot(px / 1e3 - ex, py / 1e3 - ey) <= near:
@@ -208,6 +210,8 @@ class Gate:
             return None
         jumps = list(map(sub, q, self._before))
         text = f"motor angles {_listed(q)} rad"
+        if all(map(math.isnan, q)):
+            return "no motor angles were measured", False
         if not all(map(math.isfinite, q)):
             return f"{text} are not finite", False
         text += f", expected {_listed(expected)} rad"
