@@ -52,7 +52,7 @@ def new(options: argparse.Namespace) -> int:
     print(json.dumps(new_record(chosen, found, written)) if options.json else new_table(chosen, found))
     scene = folder / "scene.toml"
     print(f"\nwritten to {folder}; next: pcr-mpc check {scene}, pcr-mpc track {scene}", file=sys.stderr)
-    return _verdict(found)
+    return _verdict(found, shown=not options.json)
 
 
 def _kept(chosen: Design) -> Design:
@@ -95,7 +95,7 @@ def check(options: argparse.Namespace) -> int:
 
         plot_check(found, options.picture)
         print(f"drawn in {options.picture}", file=sys.stderr)
-    return _verdict(found)
+    return _verdict(found, shown=not options.json)
 
 
 def _with_file(remark: Remark, options: argparse.Namespace) -> Remark:
@@ -103,11 +103,12 @@ def _with_file(remark: Remark, options: argparse.Namespace) -> Remark:
     return remark if file is None else replace(remark, text=f"{file}: {remark.text}")
 
 
-def _verdict(found: Examination) -> int:
-    """Exit status of what can run as asked; raises for what cannot."""
+def _verdict(found: Examination, *, shown: bool) -> int:
+    """Exit status of what can run as asked; raises for what cannot, with why where the table has not shown it."""
     if found.errors:
         first = found.errors[0]
         more = f" (and {len(found.errors) - 1} more)" if len(found.errors) > 1 else ""
         asked = "cannot be held" if found.scene is None else "cannot run as asked"
-        raise ModelError(f"{found.name} {asked}: {first.text}{more}", key=first.about, said=True)
+        why = f"{first.about} (ERROR in the table)" if shown else first.text
+        raise ModelError(f"{found.name} {asked}: {why}{more}", key=first.about, said=True)
     return 0

@@ -10,9 +10,9 @@ from matplotlib import image
 
 from pcr_mpc import HoldMotors, Plant, load_robot, load_scene, make_controller, shipped, simulate
 from pcr_mpc.cli import main
-from pcr_mpc.design.examination import examine
+from pcr_mpc.design.examination import Examination, examine
 from pcr_mpc.design.reach import tips_within
-from pcr_mpc.design.remarks import about_steps, unidentifiable
+from pcr_mpc.design.remarks import Remark, about_steps, unidentifiable
 from pcr_mpc.loop.references.trajectory import Hold
 from pcr_mpc.report.check_picture import plot_check
 from pcr_mpc.report.check_tables import check_table
@@ -124,6 +124,16 @@ def test_a_scene_that_cannot_run_as_asked_fails(capsys):
     assert record["remarks"][0]["level"] == "error"
     assert "limited cannot run as asked: the reference asks for motor" in captured.err
     assert record["reference"]["peaks"]["motor rate"]["used"] > 1
+
+
+def test_what_the_table_has_said_at_length_is_not_said_twice(monkeypatch, capsys):
+    found = Examination("limited", None, load_scene(shipped("limited")), remarks=[Remark("error", "reference", "why")])
+    monkeypatch.setattr("pcr_mpc.cli.new.examine", lambda _: found)
+    monkeypatch.setattr("pcr_mpc.cli.new.check_table", lambda one: one.remarks[0].text)
+    assert main(["check", "limited"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "why\n"
+    assert captured.err == "pcr-mpc: limited cannot run as asked: reference (ERROR in the table)\n"
 
 
 def still(scene, **other):
