@@ -77,6 +77,7 @@ def test_the_feed_forward_carries_the_inertia_of_the_rods():
     assert errors["condensed"] < 4e-4 < 0.01 < errors["none"]
 
 
+@pytest.mark.slow
 def test_heavy_rods_are_driven_better_by_a_model_that_knows_their_inertia():
     """Both by multiple shooting, for heavy rods sag."""
     scene = replace(load_scene(MODELS / "scenes" / "heavy_rods.toml"), duration=0.3)
