@@ -28,8 +28,13 @@ from .errors import CompilerError
 # Without -ffast-math the results are those of the interpreter, bit for bit. What is added to -O1 saves a fifth of the
 # time: helpers of a line are inlined, roots set no errno, numbers are loaded before they are needed. -O3 saves a tenth
 # more, and takes twice as long to build.
-_FLAGS = ("-O1", "-fno-semantic-interposition", "-finline-small-functions", "-fno-math-errno", "-fno-trapping-math",
-          "-fschedule-insns", "-ffp-contract=off", "-fPIC", "-shared")  # fmt: skip
+_ALWAYS = ("-fno-semantic-interposition", "-finline-small-functions", "-fno-math-errno", "-fno-trapping-math",
+           "-ffp-contract=off", "-fPIC", "-shared")  # fmt: skip
+_FLAGS = ("-O1", "-fschedule-insns", *_ALWAYS)
+# Registers of what is very long are looked for in a time that grows with the square of its length: a graph of three
+# rods takes 12 s. Without that search it takes two, and a tenth more each time that it is evaluated.
+_LONG = 300_000  # characters of C
+_LONG_FLAGS = ("-Og", *_ALWAYS)
 
 
 def has_compiler() -> bool:
@@ -76,7 +81,8 @@ def compiled(function: Any) -> Any:
     generator = ca.CodeGenerator(f"{function.name()}.c")
     generator.add(function)
     source = generator.dump()
-    key = _digest("\0".join([source, platform.machine(), _version(), *_compiler(), *_FLAGS]).encode())
+    flags = _FLAGS if len(source) < _LONG else _LONG_FLAGS
+    key = _digest("\0".join([source, platform.machine(), _version(), *_compiler(), *flags]).encode())
     cache = cache_folder()
     library = None if cache is None else _found(cache, key)
     if library is not None:
@@ -84,7 +90,7 @@ def compiled(function: Any) -> Any:
     # Of a cache that others could write to, or that cannot be written at all, nothing is used.
     try:
         with tempfile.TemporaryDirectory(dir=cache) as folder:
-            library = _built(function.name(), source, Path(folder))
+            library = _built(function.name(), source, flags, Path(folder))
             if cache is None:
                 return _loaded(function.name(), library)
             place = cache / f"{key}-{_digest(library.read_bytes())}.so"
@@ -94,11 +100,11 @@ def compiled(function: Any) -> Any:
     return _loaded(function.name(), place)
 
 
-def _built(name: str, source: str, folder: Path) -> Path:
+def _built(name: str, source: str, flags: tuple[str, ...], folder: Path) -> Path:
     path, library = folder / f"{name}.c", folder / f"{name}.so"
     path.write_text(source)
     print(f"building machine code of {name!r} ({len(source) // 1000} kB of C), once", file=sys.stderr)
-    command = [*_compiler(), *_FLAGS, str(path), "-o", str(library), "-lm"]
+    command = [*_compiler(), *flags, str(path), "-o", str(library), "-lm"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, errors="replace")
     if done.returncode or not library.is_file():
         raise _failure(name, done.stderr.strip() or f"it ended with status {done.returncode} and said nothing")

@@ -130,6 +130,9 @@ def test_a_change_of_source_flags_compiler_or_machine_builds_anew(folder, compil
     assert len(built(folder)) == 2
     monkeypatch.setattr("pcr_mpc.compiled._FLAGS", ("-O0", "-ffp-contract=off", "-fPIC", "-shared"))
     keys.append(key())
+    with monkeypatch.context() as long:  # what is long is compiled in another way, to the same bits
+        long.setattr("pcr_mpc.compiled._LONG", 0)
+        keys.append(key())
     monkeypatch.setenv("CC", f"{compiler} -DANYTHING")
     keys.append(key())
     monkeypatch.setattr("platform.machine", lambda: "another")
