@@ -69,6 +69,12 @@ class Table:
         """Build the error that says what is wrong with ``key``."""
         return ModelError(f"{self.path}: {self.name}{key}: {problem}", file=str(self.path), key=key, **details)
 
+    def refuse_misspelt(self, *keys: str) -> None:
+        """Raise if a key that is left may be meant for one of these, which are missing: before that is said of them."""
+        for other in self._data:
+            if other not in keys and (near := difflib.get_close_matches(other, keys, n=1, cutoff=_NEAR)):
+                raise self.fail(other, f"unknown key; did you mean {near[0]!r}?", nearest=near[0])
+
     def _unknown(self, key: str) -> None:
         parts = [known for known in self._known if len(key) >= _WORD and key in known]
         nearest = next(iter([*difflib.get_close_matches(key, self._known, n=1, cutoff=_NEAR), *parts]), None)
@@ -83,9 +89,7 @@ class Table:
             return self._data.pop(key)
         if default is _REQUIRED:
             # A misspelt required key is both missing and unknown: name the misspelling.
-            for other in self._data:
-                if difflib.get_close_matches(other, [key], n=1, cutoff=_NEAR):
-                    raise self.fail(other, f"unknown key; did you mean {key!r}?", nearest=key)
+            self.refuse_misspelt(key)
             raise self.fail(key, "missing")
         return default
 
@@ -267,7 +271,8 @@ def _at_hand(path: Path) -> str:
     if not (kinds := kinds_of(path.stem)):
         return ""
     kind = kinds[0] if len(kinds) == 1 else " and a ".join(kinds)
+    come = "comes" if len(kinds) == 1 else "come"
     return (
-        f"; a {kind} of that name comes with the package: on the command line give {path.stem}, without folder and "
+        f"; a {kind} of that name {come} with the package: on the command line give {path.stem}, without folder and "
         f'".toml", in Python shipped("{path.stem}", "{kinds[0]}")'
     )

@@ -7,17 +7,18 @@ from pathlib import Path
 
 from ..toml_table import read_toml
 
-# First word of the key, or what a remark is about.
-_OF_TUNING, _OF_SCENE = ("controller", "model", "learning", "observer"), ("plant",)
+# First word of the key.
+_OF_TUNING, _OF_SCENE = ("model", "learning", "observer"), ("plant", "reference")
 
 
 def file_behind(key: str, options: argparse.Namespace) -> Path | None:
-    """Return the scene, or the tuning that it names, or that the options name in its place."""
+    """Return the scene, or the path or the tuning that it names, or that the options name in its place."""
     word, scene = key.split(".")[0], getattr(options, "scene", None) or getattr(options, "target", None)
     if scene is None or word not in (*_OF_TUNING, *_OF_SCENE):
         return None
     if word in _OF_SCENE:
-        return Path(scene)
+        points = read_toml(scene).table("reference", {}).text("file", None) if word == "reference" else None
+        return Path(scene) if points is None else Path(scene).parent / points
     if own := getattr(options, "controller", None):
         return own if isinstance(own, Path) else None
     named = read_toml(scene).table("control", {}).text("tuning", None)

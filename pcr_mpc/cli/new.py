@@ -99,7 +99,8 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _with_file(remark: Remark, options: argparse.Namespace) -> Remark:
-    file = file_behind(remark.about, options) if remark.level == "error" else None
+    key = {"controller": "model", "plant": "plant", "start of the reference": "reference"}.get(remark.about)
+    file = file_behind(key, options) if key and remark.level == "error" else None
     return remark if file is None else replace(remark, text=f"{file}: {remark.text}")
 
 

@@ -21,7 +21,7 @@ _KNOWN = {
 
 
 def check_scope(scene: Scene, tuning: Tuning | None) -> Tuning:
-    """Return the tuning whose controller is generated, or say what of the scene C does not have yet.
+    """Return the tuning whose controller is generated, or say what of the scene C does not have.
 
     Raises
     ------
@@ -34,12 +34,12 @@ def check_scope(scene: Scene, tuning: Tuning | None) -> Tuning:
     for part, found, known, advice in _choices(scene, tuning):
         if found not in known:
             named = ", ".join(map(str, known))
-            raise GenerationError(f"{scene.name}: C has no {part} {found!r} yet, only {named}; {advice}", part=part)
+            raise GenerationError(f"{scene.name}: C has no {part} {found!r}, only {named}; {advice}", part=part)
     for what, of in (("scene", scene), ("tuning", tuning), ("model", tuning.model)):
         for field in fields(of):
             value = getattr(of, field.name)
             if field.name not in _KNOWN[what].split() and value != field.default:
-                raise GenerationError(f"{scene.name}: C does not know {field.name} of the {what} yet, which is "
+                raise GenerationError(f"{scene.name}: C does not know {field.name} of the {what}, which is "
                                       f"{value!r}; leave it out", part=field.name)  # fmt: skip
     return tuning
 

@@ -88,7 +88,8 @@ def examine(what: Robot | Scene, *, modes: bool = True, upright: float | None = 
     try:
         found.pose = pose = scene.start() if scene is not None else _usual_pose(robot)
     except PCRError as error:
-        found.remarks += [Remark("error", "start", str(error)), *unidentifiable(robot)]
+        about = "start of the reference" if error.details.get("key") == "reference" else "start"
+        found.remarks += [Remark("error", about, str(error)), *unidentifiable(robot)]
         return found
     mass, share = moving_mass(pose)
     found.figures["start"] = _pose_figures(pose, mass, share)

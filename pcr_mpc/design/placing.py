@@ -25,7 +25,7 @@ _POINTS = 16  # of a path at which it is judged
 _SIZES = (1.0, 0.8, 0.6, 0.4, 0.25, 0.15)  # of the largest path that are tried
 _LARGE_ENOUGH = 0.8
 _ATTEMPTS = 6  # at a diameter or a length that works
-_FARTHEST = 4.0  # change of a diameter or a length that is worth a word
+FARTHEST = 4.0  # change of a diameter or a length that is worth a word
 
 Place = tuple[Layout, float, list[Equilibrium]]
 
@@ -139,7 +139,7 @@ def _nearest(wish: Wish, motor: Motor, thinner: float, longer: float) -> list[st
     if wish.spacing is not None and place(replace(wish, spacing=None), motor)[0] is not None:
         advice.append("without --spacing")
     for key, first, step in ((wish.across, wish.thick / thinner, 0.97), ("length", wish.length * longer, 1.04)):
-        if not 1 / _FARTHEST <= first / getattr(wish, key) <= _FARTHEST:
+        if not 1 / FARTHEST <= first / getattr(wish, key) <= FARTHEST:
             continue
         for attempt in range(_ATTEMPTS):
             value = rounded(first * step ** (attempt + 1), up=step > 1, down=step < 1)

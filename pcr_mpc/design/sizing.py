@@ -13,7 +13,7 @@ from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from .layout import Layout
 from .motors import MOTORS, Motor, motor_named
-from .placing import TORQUE_USED, place, refusal
+from .placing import FARTHEST, TORQUE_USED, place, refusal
 from .wish import LEAST_MASS, Wish, length_text, rounded
 
 _USUAL_SWING = 0.4  # s, of the tip on its rods: slow enough for any motor, fast enough not to be boring
@@ -108,12 +108,12 @@ def _require_swings(wish: Wish, mass: float, rod_mass: float, slowest: float, fa
         most = (mass + share) * (_SLOWEST_SWING / slowest) ** 2 - share
         # With the mass of the tip that of its rods, a swing takes a time as L^2/d.
         ratio = slowest / _SLOWEST_SWING
-        advice = (
-            f"at most {rounded(most, down=True):.2g} kg (--tip-mass)"
-            if most > rod_mass / 2
-            else f"about {length_text(rounded(1.05 * ratio * wish.thick, up=True))} {wish.across}, or "
-            f"{length_text(rounded(wish.length / math.sqrt(1.05 * ratio), down=True))} length"
-        )
+        advice = f"at most {rounded(most, down=True):.2g} kg (--tip-mass)"
+        if most <= rod_mass / 2:
+            advice = f"about {length_text(rounded(wish.length / math.sqrt(1.05 * ratio), down=True))} length"
+            if ratio <= FARTHEST:
+                thick = length_text(rounded(1.05 * ratio * wish.thick, up=True))
+                advice = f"about {thick} {wish.across}, or {advice.removeprefix('about ')}"
         raise InfeasibleError(
             f"a tip of {mass:.3g} kg swings on these rods once in {slowest:.3g} s, and a path would take minutes; "
             f"nearest that works: {advice}",

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..errors import ModelError, check_numbers
 from ..files import name_problem
-from ..plant.materials import MATERIALS, Material, Section
+from ..plant.materials import MATERIALS, Material, Section, known_materials, nearest_material
 from ..plant.robot import Robot
 from ..plant.rod import Rod
 from .layout import Layout
@@ -17,6 +16,7 @@ from .motors import Motor
 
 LEAST_MASS = 6.0  # of the tip that is chosen, in rods: what light rods are
 _MOST_RODS = 4
+_THREAD = 2e4  # length over thickness from which a rod is a thread, or its length in millimetres
 _SLENDER = 50.0  # length over diameter from which a rod is a beam that bends and does nothing else
 
 
@@ -62,9 +62,9 @@ class Wish:
         given = [key for key in ("spacing", "tip_mass", "width", "thickness") if getattr(self, key) is not None]
         check_numbers(self, {key: {"above": 0.0} for key in ("diameter", "length", *given)})
         if self.material not in MATERIALS:
-            near = difflib.get_close_matches(self.material, MATERIALS, n=1)
-            hint = f"did you mean {near[0]}? " if near else ""
-            known = ", ".join(MATERIALS)
+            near = nearest_material(self.material)
+            hint = f"did you mean {near}? " if near else ""
+            known = known_materials()
             raise ModelError(f"material {self.material!r} is not known; {hint}known are {known}", key="material")
         if (self.width is None) != (self.thickness is None):
             missing = "width" if self.width is None else "thickness"
@@ -80,6 +80,13 @@ class Wish:
                 f"rods {length_text(self.length)} long and {length_text(self.thick)} thick are no slender rods: "
                 f"they are to be at least {_SLENDER:g} {'diameters' if self.width is None else 'times as'} long, "
                 f"{length_text(_SLENDER * self.thick)}. Numbers are in metres",
+                key="length",
+            )
+        if self.length > _THREAD * self.thick:
+            raise ModelError(
+                f"rods {length_text(self.length)} long and {length_text(self.thick)} thick are threads, "
+                f"{self.length / self.thick:.2g} times as long as thick, and at most {_THREAD:g} times is expected. "
+                "Numbers are in metres: 500 mm are 0.5",
                 key="length",
             )
 

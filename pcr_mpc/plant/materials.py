@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from dataclasses import dataclass
 
@@ -162,3 +163,27 @@ MATERIALS = {
         ),
     )
 }
+
+# What the names mean, and other words for it.
+_MEANING = {
+    "spring_steel": "steel wire and strip",
+    "nitinol": "superelastic, Ni-Ti",
+    "nitinol_linear": "cold-worked, NiTi without a plateau",
+    "titanium": "Ti-6Al-4V",
+    "gfrp": "glass fibre, fibreglass, fiberglass",
+    "cfrp": "carbon fibre, carbon",
+    "peek": "plastic",
+}
+
+
+def known_materials() -> str:
+    """Names of all materials, each with what it means."""
+    return ", ".join(f"{name} ({_MEANING[name].split(', ')[0]})" for name in MATERIALS)
+
+
+def nearest_material(name: str) -> str | None:
+    """Which one may be meant by a name that none has, by its letters or by another word for it."""
+    words = {word: key for key, meaning in _MEANING.items() for word in (key, key.split("_")[-1], *meaning.split(", "))}
+    asked = name.lower().replace("_", " ").replace("-", " ")
+    near = difflib.get_close_matches(asked, words, n=1) or difflib.get_close_matches(name, MATERIALS, n=1)
+    return words.get(near[0], near[0]) if near else None

@@ -33,6 +33,8 @@ _LEAST_SLACK = 1e-9
 # Beyond it the rounding of an angle, 1e-10 rad, shows in the shape of a rod [rad].
 _LARGEST_ANGLE = 1e6
 
+_FAR = 100.0  # times as long as the motors are apart, or the other way round: one of them is in another unit
+
 
 @dataclass(frozen=True)
 class Robot(Frozen):
@@ -200,7 +202,8 @@ def load_robot(path: str | Path) -> Robot:
     Warns
     -----
     UserWarning
-        A motor may turn more than four turns from zero: its limits look like degrees.
+        A motor may turn more than four turns from zero: its limits look like degrees. Rods are a hundred times as long
+        as the motors are apart, or the other way round: one of them looks like millimetres.
     """
     with read_toml(path) as file:
         name = file.text("name")
@@ -220,4 +223,25 @@ def load_robot(path: str | Path) -> Robot:
                 **{key: motors.number(key, **ROBOT_NUMBERS[key])
                    for key in ("rate_limit", "acceleration_limit", "torque_limit")},
             }  # fmt: skip
-        return Robot(name=name, rods=tuple(rods), gravity=gravity, **numbers)
+        robot = Robot(name=name, rods=tuple(rods), gravity=gravity, **numbers)
+    if doubt := _doubtful_lengths(robot):
+        warnings.warn(f"{path}: {doubt}", stacklevel=2)
+    return robot
+
+
+def _doubtful_lengths(robot: Robot) -> str:
+    """Say of lengths that do not go with where the motors are what they would be as millimetres."""
+    apart = float(np.linalg.norm(robot.bases[:, None] - robot.bases, axis=2).max())
+    longest = float(robot.lengths.max())
+    if longest > _FAR * apart:
+        i = int(robot.lengths.argmax())
+        return (
+            f"rods[{i}].length is {longest:g} m, {longest / apart:.2g} times as far as the motors are apart, "
+            f"{apart:g} m; if it is in millimetres, it is {longest / 1e3:g} m"
+        )
+    if apart > _FAR * longest:
+        return (
+            f"rods.base: motors are {apart:g} m apart, where the longest rod has {longest:g} m; if it is in "
+            f"millimetres, they are {apart / 1e3:g} m apart"
+        )
+    return ""

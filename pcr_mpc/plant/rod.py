@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import warnings
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 
 from ..errors import ModelError, check_numbers, checked_number, checked_vector
 from ..toml_table import Table
-from .materials import MATERIALS, Material, Section, check_unit
+from .materials import MATERIALS, Material, Section, check_unit, known_materials, nearest_material
 
 # SI units; wide enough for DNA and for bridges, and no product of a few such numbers overflows.
 POSITIVE = {"minimum": 1e-30, "maximum": 1e30}
@@ -28,6 +27,7 @@ MANY_TURNS = 8.0 * math.pi
 _STOUT = 0.2
 # EI or line density may be stated beside a section that gives another one by this much: sections have tolerances.
 _AGREEMENT = 0.02
+_SECTION = ("diameter", "inner_diameter", "width", "thickness")
 _RUBBER = 1e7  # [Pa]; softer is rather a number of megapascals
 
 
@@ -181,6 +181,8 @@ def read_rod(table: Table) -> Rod:
     base, length = table.vector("base", 2), table.number("length", **POSITIVE)
     material = _read_material(table)
     section = _read_section(table, length)
+    if section is None:
+        table.refuse_misspelt(*_SECTION)
     if section is None and (given := [name for name, value in material.items() if value is not None]):
         raise table.fail(
             given[0],
@@ -216,11 +218,11 @@ def _read_material(table: Table) -> dict[str, float | None]:
     """E, density and strain limit as stated, or of the material that is named; None where neither says."""
     name = table.text("material", "")
     if name and name not in MATERIALS:
-        near = difflib.get_close_matches(name, MATERIALS, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
+        near = nearest_material(name)
+        hint = f"did you mean {near!r}? " if near else ""
         raise table.fail(
             "material",
-            f"{name!r} is not known; {hint}known are {', '.join(MATERIALS)}; of another, state youngs_modulus [Pa], "
+            f"{name!r} is not known; {hint}known are {known_materials()}; of another, state youngs_modulus [Pa], "
             "density [kg/m^3] and strain_limit",
         )
     found: dict[str, float | None] = {}
@@ -267,11 +269,11 @@ def _stated(table: Table, key: str, product: float | None, factor: str) -> float
 
 def _read_section(table: Table, length: float) -> Section | None:
     """Round, tube or strip by the keys that are there; None if there are none."""
-    names = ("diameter", "inner_diameter", "width", "thickness")
-    found = {name: table.number(name, above=0.0, **POSITIVE) for name in names if table.has(name)}
+    found = {name: table.number(name, above=0.0, **POSITIVE) for name in _SECTION if table.has(name)}
     if not found:
         return None
     if set(found) not in ({"diameter"}, {"diameter", "inner_diameter"}, {"width", "thickness"}):
+        table.refuse_misspelt(*(name for name in _SECTION if name not in found))
         raise table.fail(
             next(iter(found)),
             f"found {', '.join(found)}; a section is a diameter, diameter and inner_diameter, or width and thickness",

@@ -170,6 +170,12 @@ def test_stated_and_computed_may_both_be_there_if_they_agree(robot_file):
     [
         (['material = "nitinoll"', "diameter = 1e-3"], "did you mean 'nitinol'?"),
         (['material = "unobtainium"', "diameter = 1e-3"], "of another, state youngs_modulus"),
+        (['material = "nitinol"', "diametre = 1e-3"], r"diametre: unknown key; did you mean 'diameter'"),
+        (
+            ['material = "nitinol"', "width = 1e-2", "thicknes = 1e-3"],
+            r"thicknes: unknown key; did you mean 'thickness'",
+        ),
+        (['material = "fibreglass"', "diameter = 1e-3"], r"did you mean 'gfrp'\? known are .* gfrp \(glass fibre\)"),
         (['material = "nitinol"'], "says nothing without the rod's section"),
         (["bending_stiffness = 0.05", "line_density = 0.01", "strain_limit = 0.01"], "strain_limit: says nothing"),
         (["bending_stiffness = 0.05", "line_density = 0.01", "density = 7850.0"], "density: says nothing"),

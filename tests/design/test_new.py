@@ -177,6 +177,8 @@ def test_motors_by_name():
     ("numbers", "message"),
     [
         ({"rods": 5}, "rods is 5, expected 2 to 4"),
+        ({"length": 500.0}, r"5e\+05 times as long as thick, .* Numbers are in metres: 500 mm are 0\.5"),
+        ({"material": "carbon"}, r"did you mean cfrp\? known are spring_steel \(steel wire and strip\)"),
         ({"material": "nitinl"}, r"'nitinl' is not known; did you mean nitinol\?"),
         ({"diameter": 1.0}, "no slender rods: they are to be at least 50 diameters long, 50 m"),
         ({"diameter": -1e-3}, "diameter: is -0.001"),

@@ -77,16 +77,32 @@ def require_within_stops(scene: Any) -> None:
             )
 
 
+def begins(scene: Any) -> bool:
+    """Whether the tip starts where the reference begins."""
+    if scene.trajectory is None or scene.start_tip is None:
+        return False
+    return bool(np.array_equal(sampled(scene.trajectory, np.zeros(1))[0, 0], scene.start_tip))
+
+
 def require_reach(scene: Any) -> None:
     """Raise if a rod is too short for the start or for the reference, which costs no statics to see."""
-    # A start that follows from the reference is the reference's to blame.
-    begins = None if scene.trajectory is None else sampled(scene.trajectory, np.zeros(1))[0, 0]
-    if scene.start_tip is not None and (begins is None or not np.array_equal(begins, scene.start_tip)):
-        try:
-            scene.robot.require_reachable(np.array(scene.start_tip))
-        except UnreachableError as error:
-            units = _units_hint(np.array([scene.start_tip]), scene.robot)
-            raise ModelError(f"{scene.name}: start.tip: {error}{units}", key="start.tip", **error.details) from None
+    # A start that follows from the reference is nowhere in the file: the reference is to be named.
+    checks = (_require_reference, _require_start) if begins(scene) else (_require_start, _require_reference)
+    for check in checks:
+        check(scene)
+
+
+def _require_start(scene: Any) -> None:
+    if scene.start_tip is None:
+        return
+    try:
+        scene.robot.require_reachable(np.array(scene.start_tip))
+    except UnreachableError as error:
+        units = _units_hint(np.array([scene.start_tip]), scene.robot)
+        raise ModelError(f"{scene.name}: start.tip: {error}{units}", key="start.tip", **error.details) from None
+
+
+def _require_reference(scene: Any) -> None:
     if scene.trajectory is None:
         return
     t = scene.period * np.arange(scene.n_periods + 1)

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from ...control.tuning import Tuning
-from ...errors import ModelError
+from ...errors import ConvergenceError, ModelError, PCRError
 from ...linearisation.pose_limits import PoseLimits
 from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
@@ -18,7 +18,7 @@ from ...plant.statics.free_tip import forward_statics, inverse_statics
 from ..hardware.camera import Camera
 from ..hardware.motors import Motors
 from ..references.trajectory import Trajectory
-from .checks import LATE, check_scene, is_multiple, require_within_stops
+from .checks import LATE, begins, check_scene, is_multiple, require_within_stops
 from .settings import Finding, Need, Payload, PlantSettings
 
 # Distance of the start that is found from the reference that is taken for the same place, in rod lengths.
@@ -188,9 +188,12 @@ class Scene:
 
         Raises
         ------
+        ConvergenceError
+            No pose of the mode holds the tip.
         ModelError
-            The free tip at ``start_motors`` is not where the reference begins, these are beyond a stop, or to hold
-            the start takes more torque than the motors have.
+            Nor where the reference begins, if that is where the tip is; or the free tip at ``start_motors`` is not
+            where the reference begins, these are beyond a stop, or to hold the start takes more torque than the motors
+            have.
         """
         eq = self._start()
         i = int(np.abs(eq.motor_torque).argmax())
@@ -219,7 +222,26 @@ class Scene:
                     )
             return eq
         assert self.start_tip is not None
-        return _held(self.robot, self.start_tip, self.start_mode)
+        try:
+            return _held(self.robot, self.start_tip, self.start_mode)
+        except ConvergenceError as error:
+            if not begins(self):
+                raise
+            raise ModelError(
+                f"{self.name}: where the reference begins, {error}{self._if_exchanged()}", key="reference", t=0.0
+            ) from error
+
+    def _if_exchanged(self) -> str:
+        """Whether x and y of a start that cannot be held may have been exchanged."""
+        assert self.start_tip is not None
+        try:
+            # By multiple shooting a search in vain takes long.
+            if self.robot.needs_shooting is None and self.start_tip[0] != self.start_tip[1]:
+                _held(self.robot, self.start_tip[::-1], self.start_mode)
+                return "; with x and y exchanged there is one: are they exchanged in the reference?"
+        except PCRError:
+            pass
+        return ""
 
     def make_plant(self) -> Plant:
         """Build the plant of this scene."""
