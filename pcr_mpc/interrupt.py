@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
+_LISTEN = 0.1  # s, between looks at whether to stop
 _noted: int | None = None
 _nothing_to_lose = False
 
@@ -22,6 +24,31 @@ def check() -> None:
     """Raise `KeyboardInterrupt` if a signal to stop was noted."""
     if _noted is not None:
         raise KeyboardInterrupt
+
+
+def completed(command: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run another program, and end it and raise `KeyboardInterrupt` if a signal to stop is noted meanwhile.
+
+    Raises
+    ------
+    OSError
+        There is no such program.
+    """
+    # In a session of its own: Ctrl-C in a terminal is ours alone, and what the program has started ends with it.
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace",
+                          start_new_session=True) as process:  # fmt: skip
+        try:
+            while True:
+                with suppress(subprocess.TimeoutExpired):
+                    out, err = process.communicate(timeout=_LISTEN)
+                    return subprocess.CompletedProcess(command, process.returncode, out, err)
+                check()
+        except BaseException:
+            if hasattr(os, "killpg"):
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+            process.kill()
+            raise
 
 
 def exit_status() -> int:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .. import interrupt
 from ..control.plan import Plan
 from ..errors import CompilerError, MeasurementError, PCRError
 from ..loop.parts.controllers import Decision
@@ -34,7 +34,7 @@ def run_make(folder: Path, *words: str) -> None:
     """
     command = ["make", "-s", "-C", str(folder), *words]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, errors="replace")
+        done = interrupt.completed(command)
     except OSError as error:
         raise CompilerError(
             f"cannot build {folder}: {error}; it needs make and a C compiler", command=command

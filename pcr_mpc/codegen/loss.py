@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from .. import interrupt
 from ..errors import GenerationError
 from .library import run_make
 
@@ -74,7 +74,7 @@ def measure_loss(scene: str, write: Callable[[Path], None], double_rms_mm: float
     with tempfile.TemporaryDirectory(prefix="pcr-mpc-") as place:
         write(Path(place))
         run_make(Path(place), "CFLAGS=-O1", "GRAPH_CFLAGS=-O1", "example")
-        done = subprocess.run([str(Path(place) / "example")], capture_output=True, text=True, check=False)
+        done = interrupt.completed([str(Path(place) / "example")])
     said = done.stdout
     numbers = re.findall(r"differ by at most (\S+) rad/s, rung or iterations in (\d+) of (\d+)", said)
     rms = re.search(r"RMS error of the tip\s+(\S+) mm", said)

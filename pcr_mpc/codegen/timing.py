@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import interrupt
 from ..errors import CompilerError
 from ..loop.scene.scene import Scene
 from .folder import write_folder
@@ -21,7 +21,7 @@ from .subject import Subject
 from .vectors import recorded
 
 _TOLERANCE = re.compile(r"(#define PCR_TOLERANCE) .*")
-_RUNS = 5  # of the scene, with a solver that is never content
+_RUNS = 5  # of the scene, at most, with a solver that is never content
 _ANOTHER_RUN = 2  # result of an example that ends, and not as Python did
 
 
@@ -61,7 +61,7 @@ def time_in_c(scene: Scene, solver: str, steps: int) -> dict[str, Any]:
         config, capped = folder / "pcr_config.h", None
         if solver == "osqp":  # what DAQP does it does in finitely many iterations, whatever the tolerance
             config.write_text(_TOLERANCE.sub(r"\g<1> 1e-30", config.read_text(encoding="utf-8")), encoding="utf-8")
-            capped = _run(folder, _RUNS * periods, strict=False)
+            capped = _run(folder, min(_RUNS * periods, steps), strict=False)
     count = len(times) // (1 + per)
     least = _least(times, per, periods)
     longest = None if capped is None or isinstance(capped, str) else _least(capped, per, periods)
@@ -76,7 +76,7 @@ def _run(folder: Path, steps: int, *, strict: bool = True) -> np.ndarray | str:
     """
     run_make(folder, "example")
     file = folder / "times"
-    done = subprocess.run([str(folder / "example"), str(steps), str(file)], capture_output=True, text=True, check=False)
+    done = interrupt.completed([str(folder / "example"), str(steps), str(file)])
     if done.returncode not in ((0,) if strict else (0, _ANOTHER_RUN)):
         return done.stdout.strip()
     return np.asarray(1e-6 * np.fromfile(file).reshape(-1, 2))

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -94,6 +95,15 @@ def test_waiting_for_workers_ends_too():
         os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
             list(as_finished([Future()]))
+
+
+def test_another_program_ends_with_what_it_has_started():
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    began = time.monotonic()
+    with interrupt.listening(), pytest.raises(KeyboardInterrupt):
+        interrupt.completed(["sh", "-c", "sleep 60; true"])
+    assert time.monotonic() - began < 30.0
+    assert interrupt.completed(["sh", "-c", "echo said; exit 3"]).stdout == "said\n"
 
 
 @pytest.mark.parametrize(("kind", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])

@@ -191,3 +191,11 @@ def test_parameters_become_tunings_of_three_digits_and_back(scene):
     assert "period" not in space(replace(search, scene=replace(scene, deadline=0.004)))
     brief = replace(search, scene=replace(scene, duration=0.01))
     assert set(space(brief)["period"].choices) == {0.005, 0.01}
+
+
+def test_what_was_measured_is_kept_where_c_is_interrupted():
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    scene = load_scene(MODELS / "scenes" / "lemniscate.toml")
+    assert timing._in_c(stopped, scene, 500, [], {}, progress=False) == [{"solver": "OSQP", "missing": "interrupted"}]

@@ -34,7 +34,8 @@ def add(command: Command) -> None:
     )
     timing.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
     timing.add_argument("--steps", type=int, default=100_000,
-                        help="plant steps and control steps (default 100000: two or three minutes)")  # fmt: skip
+                        help="plant steps and control steps (default 100000: two or three minutes); whatever the "
+                        "number, C is compiled besides: a minute")  # fmt: skip
     timing.add_argument("--out", type=Path, help="folder for the results (default results/timing/NAME)")
 
     margins = command(

@@ -100,13 +100,13 @@ def time_scene(
             {"iterations": int(count), **distribution(wall[calm & (iterations == count)])}
             for count in np.unique(iterations[calm])
         ]
+    result["overhead"] = call_overhead(scene.robot, run.pose)
     if in_c is not None and isinstance(controller, TrackingController):
         result["c"] = _in_c(in_c, scene, steps, components, histogram, progress=progress)
     result["histogram"] = {
         "edges_us": _BINS.tolist(),
         **{name: found if isinstance(found, dict) else _counts(found) for name, found in histogram.items()},
     }
-    result["overhead"] = call_overhead(scene.robot, run.pose)
     after = machine()
     return {**result, "machine": {**before, "load_after": after["load"]}, "versions": versions()}
 
@@ -144,12 +144,16 @@ def _in_c(
         return []
     rows = []
     for solver, name in SOLVERS.items():
-        interrupt.check()
         own = solver == tuning.solver
         if progress:
-            print(f"{scene.name}: C with {name} is generated, compiled and run", file=sys.stderr)
+            print(f"{scene.name}: C with {name} is generated, compiled and run, half a minute or more; Ctrl-C keeps "
+                  "what was measured", file=sys.stderr)  # fmt: skip
         try:
+            interrupt.check()
             found = in_c(scene, solver, max(WARM_UP + 10, round(steps * (1.0 if own else _OTHER_SOLVER))))
+        except KeyboardInterrupt:  # what was measured is of use without it
+            rows.append({"solver": name, "missing": "interrupted"})
+            break
         except PCRError as error:
             rows.append({"solver": name, "missing": str(error)})
             continue
