@@ -63,13 +63,15 @@ def track(options: argparse.Namespace) -> int:
     used: Tuning | None = None if own else tuning or scene.tuning
     drawn = () if options.no_pictures else _pictures(used)
     require_folder(folder, (*RECORD, *drawn), force=options.overwrite)
+    if options.out is None:
+        _say_replaced(folder, options.scene)
     failure: SimulationError | None = None
     try:
         run = simulate(scene, plant, controller, options.seed, progress=True)
     except SimulationError as error:
         failure, run = error, error.run
     folder, problem = saved(partial(run.save, force=options.overwrite), folder)
-    summary = run.summary()
+    summary = {**run.summary(), "scene_file": str(options.scene)}
     if options.plant and used is not None and failure is None:
         summary["by_model_inertia"] = by_model_inertia(run, used, plant, progress=True)
     if used is not None and not interrupt.noted():
@@ -85,6 +87,20 @@ def track(options: argparse.Namespace) -> int:
     if problem or second:
         raise OutputError(problem or second, path=str(folder))
     return 0
+
+
+def _say_replaced(folder: Path, scene: Path) -> None:
+    """Say before a run that it takes the place of one of another scene of the same name."""
+    try:
+        earlier = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["scene_file"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if Path(earlier).resolve() != Path(scene).resolve():
+        print(
+            f"pcr-mpc: warning: the run of {earlier} that is in {folder} will be replaced, as the scenes have the same "
+            "name; --out takes another folder",
+            file=sys.stderr,
+        )
 
 
 def _delay_margin(scene: Scene, tuning: Tuning, reference: InverseDynamics | None) -> dict[str, Any] | None:

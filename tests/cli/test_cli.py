@@ -27,6 +27,7 @@ def test_track_writes_record_and_pictures(scene, tmp_path, capsys):
     assert main(["track", str(scene), "--out", str(out), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["failures"] == 0
+    assert summary["scene_file"] == str(scene)
     assert set(summary["files"]) == {"run.npz", "run.csv", "summary.json", "track.png", "track.gif", "replay.html"}
     assert json.loads((out / "summary.json").read_text()) == summary
     picture = image.imread(out / "track.png")

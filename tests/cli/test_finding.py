@@ -1,9 +1,12 @@
 """What a command is given in the place of what it takes is named, with what may be meant."""
 
+from pathlib import Path
+
 import pytest
 
 from pcr_mpc import shipped
 from pcr_mpc.cli import main
+from pcr_mpc.cli.track import _say_replaced
 
 
 @pytest.fixture
@@ -52,3 +55,11 @@ def test_a_name_is_that_of_the_package_though_a_folder_is_called_so(mine, tmp_pa
 
     (tmp_path / "limited").mkdir()
     assert found("limited", ("scene",), "track") == (shipped("limited"), True)
+
+
+def test_a_run_of_another_scene_of_the_same_name_is_not_replaced_without_a_word(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "summary.json").write_text('{"scene_file": "a/scene.toml"}')
+    for scene, said in (("b/scene.toml", True), ("a/scene.toml", False), (str(tmp_path / "a/scene.toml"), False)):
+        _say_replaced(tmp_path, Path(scene))
+        assert ("the run of a/scene.toml" in capsys.readouterr().err) == said
