@@ -41,7 +41,7 @@ from pcr_mpc import (
     load_tuning,
     load_uncertainty,
 )
-from pcr_mpc.cli.parser import tuning_or_class
+from pcr_mpc.cli.options.command import tuning_or_class
 from pcr_mpc.loop.controller.own_controller import OwnController
 from pcr_mpc.report.csv_rows import write_rows
 from pcr_mpc.report.plots import animate_run, plot_run

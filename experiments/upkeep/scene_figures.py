@@ -1,16 +1,17 @@
-"""What the README and the pages say of the shipped scenes: each run once with its own controller, into docs/records.
+"""What the README and the pages say of the shipped scenes: each run with its own controller, into docs/records.
 
 So is the lemniscate with motors that are later than anybody told (``late_motors``).
 
 ``python -m experiments.upkeep.scene_figures`` writes docs/records/scenes.json; ``python -m
 experiments.upkeep.text_figures --write`` then puts the figures into the text.
-Times are CPU times of the controller's thread.
+Times are CPU times of the controller's thread, the least of three runs.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,6 +26,8 @@ from pcr_mpc.study.timing.machine import machine, versions
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "models" / "scenes"
+_TIMES = ("control_cpu_us", "plant_step_us")
+_RUNS, _ENOUGH = 3, 10.0  # at most, and the time [s] after which no other is begun
 _KEPT = ("controller", "plant", "rms_mm", "rms_after_1s_mm", "max_mm", "final_error_mm", "limit_violations", "failures")
 
 
@@ -35,18 +38,21 @@ def late_motors() -> Scene:
 
 
 def measure(scene: Scene) -> dict[str, Any]:
-    """Figures of one scene."""
-    try:
-        run = simulate(scene, scene.make_plant(), make_controller(scene))
-    except SimulationError as error:
-        run = error.run
-    summary = run.summary()
-    return {name: summary[name] for name in _KEPT} | {
-        "verdict": run.verdict(),
-        "control_cpu_us": summary["control_cpu_us"],
-        "plant_step_us": summary["plant_step_us"],
-        "run_hash": summary["run_hash"],
-    }
+    """Figures of one scene; times are the least of a few equal runs: what else a computer does makes none shorter."""
+    times: dict[str, dict[str, float]] = {}
+    began = time.monotonic()
+    for _ in range(_RUNS):
+        try:
+            run = simulate(scene, scene.make_plant(), make_controller(scene))
+        except SimulationError as error:
+            run = error.run
+        summary = run.summary()
+        for name in _TIMES:
+            found = summary[name]
+            times[name] = {key: min(value, times.get(name, found)[key]) for key, value in found.items()}
+        if time.monotonic() - began > _ENOUGH:
+            break
+    return {name: summary[name] for name in (*_KEPT, "run_hash")} | {"verdict": run.verdict()} | times
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

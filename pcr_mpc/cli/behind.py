@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 
+from ..errors import PCRError
 from ..toml_table import read_toml
 
 # First word of the key.
@@ -12,7 +14,16 @@ _OF_TUNING, _OF_SCENE = ("model", "learning", "observer"), ("plant", "reference"
 
 
 def file_behind(key: str, options: argparse.Namespace) -> Path | None:
-    """Return the scene, or the path or the tuning that it names, or that the options name in its place."""
+    """Return the scene, or the path or the tuning that it names, or that the options name in its place.
+
+    None where it is not known; a file that cannot be read any more hides no error.
+    """
+    with suppress(PCRError, OSError):
+        return _file_behind(key, options)
+    return None
+
+
+def _file_behind(key: str, options: argparse.Namespace) -> Path | None:
     word, scene = key.split(".")[0], getattr(options, "scene", None) or getattr(options, "target", None)
     if scene is None or word not in (*_OF_TUNING, *_OF_SCENE):
         return None

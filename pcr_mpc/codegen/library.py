@@ -134,13 +134,13 @@ class GeneratedController:
         Raises
         ------
         MeasurementError
-            The first measurement is out of reach, in other units, or wrapped.
+            The first measurement is in other units, or wrapped.
         PCRError
             It was not started.
         """
         code = self.raw_step(x)
         if code == _FIRST_MEASUREMENT:
-            raise MeasurementError(f"first measurement: {x} is out of reach, in other units, or wrapped")
+            raise MeasurementError(f"first measurement: {x} is in other units, or wrapped")
         if code:
             raise PCRError(f"the generated controller failed: result {code} of pcr_controller_step; was it started?")
         out = self.output

@@ -115,7 +115,7 @@ def worst_case(
     found: dict[str, Any] = {"iterations": most, "flops": largest}
     if capped is None:
         return found | dict.fromkeys(("iteration_us", "rest_us", "us"))
-    slope = max(float(np.median(capped) - np.median(seconds)) / float(most - np.median(iterations)), 0.0)
+    slope = max(float(np.median(capped) - np.median(seconds)) / max(most - float(np.median(iterations)), 1.0), 0.0)
     rest = float(np.max(seconds - slope * iterations))
     each = slope * max(largest / usual, 1.0)
     return found | {"iteration_us": 1e6 * each, "rest_us": 1e6 * rest, "us": 1e6 * (rest + most * each)}

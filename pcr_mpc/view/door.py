@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hmac
 import socket
 from http import HTTPStatus
@@ -82,10 +83,19 @@ def require_address(address: tuple[str, int]) -> None:
     OutputError
     """
     try:
-        for family, kind, _, _, where in socket.getaddrinfo(*address, type=socket.SOCK_STREAM):
-            with socket.socket(family, kind) as bound:
-                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                bound.bind(where)
+        problems = []
+        for family, kind, _, _, where in (found := socket.getaddrinfo(*address, type=socket.SOCK_STREAM)):
+            try:
+                with socket.socket(family, kind) as bound:
+                    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                    bound.bind(where)
+            except OSError as error:
+                # A name may stand for addresses of kinds that this machine does not have.
+                if error.errno not in (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL):
+                    raise
+                problems.append(error)
+        if len(problems) == len(found):
+            raise problems[0]
     except OSError as error:
         raise cannot_listen(address, error) from None
 

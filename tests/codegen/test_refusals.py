@@ -124,6 +124,16 @@ def test_limits_and_weights_that_python_refuses_are_refused_in_c(subject, code):
     for key, value in (("torque", 0.0), ("torque", -1.0), ("rod_margin", 0.95), ("rod_margin", -0.1), ("reach", 0.0),
                        ("stiffness", -1.0), ("stiffness", np.inf), ("strain", np.array([0.01, -0.01])),
                        ("strain", np.array([0.01, 0.8])), ("tip_lower", np.array([np.inf, 0.0])),
+                       # What the scene does not watch cannot be switched on, nor one rod's strain switched off.
+                       ("strain", np.array([np.inf, 0.01])), ("strain", np.full(2, np.inf)),
+                       ("tip_upper", np.array([1.0, np.inf])), ("tip_lower", np.array([-np.inf, -1.0])),
                        ("gain", np.full(np.size(own["gain"]), np.inf))):  # fmt: skip
         assert places[key] <= place(**{key: value}) < places[key] + np.size(value), (key, value)
+    # No square of two states has a negative weight, all of them together have.
+    pulled = np.eye(6)
+    pulled[:3, :3] -= 0.9 * (1.0 - np.eye(3))
+    assert np.linalg.eigvalsh(pulled).min() < -0.7
+    assert place(terminal=pulled.ravel()) == places["terminal"]
+    assert place(terminal=np.ones(36)) == -1  # of rank one
+    assert place(terminal=np.zeros(36)) == -1
     assert place(torque=0.5, stiffness=-np.inf, rod_margin=-np.inf, strain=np.full(n, 0.005)) == -1

@@ -309,6 +309,7 @@ def test_a_loop_in_real_time_says_what_it_was():
     scene = load_scene(ROOT / "models" / "scenes" / "hold_slow.toml")
     found = run_hil(scene.tuned(scene.tuning)).summary()
     assert found["periods"] == scene.n_periods - 1
-    assert found["server"]["answered"] + found["server"].get("skipped", 0) <= found["periods"]
+    # The greeting is answered too.
+    assert found["server"]["answered"] + found["server"].get("skipped", 0) <= found["periods"] + 1
     assert found["missed"] < found["periods"]
     assert found["max_mm"] < 20.0  # it holds, and shifts; how well depends on the machine

@@ -236,6 +236,8 @@ def test_a_scene_file_says_that_encoders_wrap(tmp_path):
     [
         (scaled(slice(4, 6), 180 / np.pi), "degrees"),
         (scaled(slice(0, 2), 1e3), "millimetres"),
+        (scaled(slice(0, 2), 1e2), "centimetres"),
+        (lambda x: x.__setitem__(slice(0, 2), 1e3 * x[:2] + 50.0), "millimetres"),
         (added(4, -2 * np.pi), "wrapped = true"),
     ],
 )
@@ -248,6 +250,14 @@ def test_a_first_measurement_in_other_units_is_refused(started, spoil, words):
     assert isinstance(caught.value, ValueError)
     # It is as it was before.
     assert not controller.step(0, x).events
+
+
+@pytest.mark.parametrize(("place", "wrong"), [(0, -1.0), (1, 1.0), (0, 0.05), (5, 0.2)])
+def test_a_first_measurement_that_is_merely_wrong_is_bridged(started, place, wrong):
+    controller, x = started
+    decision = controller.step(0, x + wrong * (np.arange(6) == place))
+    assert [event["kind"] for event in decision.events] == ["measurement"]
+    assert np.abs(decision.u).max() < 0.01  # rad/s
 
 
 def test_what_was_not_measured_is_said_in_words(started):

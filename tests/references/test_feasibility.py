@@ -160,7 +160,7 @@ def test_what_needs_no_statics_is_said_at_once(tmp_path):
     )
     path = tmp_path / "far.toml"
     path.write_text(text.replace("[0.0, 0.25]", "[0.0, 0.45]"))
-    with pytest.raises(ModelError, match=r"far\.toml: .*start\.tip: .*0\.460977 m from the base of rod 0"):
+    with pytest.raises(ModelError, match=r"far\.toml: .*reference at t = 0\.000 s: .*0\.460977 m from the base"):
         load_scene(path)
     upwards = 'kind = "pick_and_place"\npick = [0.0, 0.25]\nplace = [0.0, 0.4]\nlift = 0.0\nwait = 0.0\nmove = 1.0'
     path.write_text(re.sub(r"kind = .*\nposition = .*", upwards, text))

@@ -24,8 +24,8 @@ typedef enum {
     PCR_OK = 0,
     PCR_NOT_STARTED = 1,       /* call pcr_controller_init or pcr_plant_init first */
     PCR_ARGUMENT = 2,          /* a number is not finite or not one that a robot can have, or an array is missing */
-    PCR_FIRST_MEASUREMENT = 3, /* the very first measurement cannot be: its tip is out of reach, as in millimetres
-                                  or centimetres, or its angles are degrees or whole turns off */
+    PCR_FIRST_MEASUREMENT = 3, /* the very first measurement is in other units: millimetres, centimetres,
+                                  degrees, whole turns off */
     PCR_OUT_OF_REACH = 4,      /* the rods cannot follow to that pose from where they are: plant and start only */
     PCR_NOT_HERE = 5           /* pcr_plant_init and pcr_plant_set_numbers, of a plant that knows only its start */
 } pcr_result;

@@ -185,6 +185,7 @@ pcr_result pcr_controller_set_parameters(pcr_controller *c, const pcr_parameters
     const int has_plan = c->has_plan, has_states = c->has_states, age = c->age;
     c->parameters = *parameters;
     write_parameters(c);
+    c->watch_at[0] = NAN; /* what was found there was another robot's */
     pcr_law_reset(c);
     c->has_plan = has_plan;
     c->has_states = has_states;

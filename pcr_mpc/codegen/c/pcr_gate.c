@@ -7,6 +7,7 @@
 #define TIP_ECHO 3.0
 #define ANGLE_ECHO 1.0
 #define TOO_LONG 0.02
+#define OTHER_UNITS 20.0
 #define PATIENCE 30
 #define TURN 6.283185307179586477
 #define TURN_IN_A_PERIOD(c) ((c)->parameters.rate * PCR_PERIOD * (1.0 + 1e-9) + PCR_ANGLE_STEP)
@@ -71,9 +72,12 @@ static oddity odd_tip(const pcr_controller *controller, const double *x, const d
         }
         return ODD;
     }
-    if (isfinite(away) && (hypot(x[0] / 1e3 - expected[0], x[1] / 1e3 - expected[1]) <= near
-                           || too_far(controller, x, TOO_LONG))) {
-        return ODD_UNITS;
+    for (double unit = 1e2; isfinite(away) && unit <= 1e3; unit *= 10.0) { /* centimetres, millimetres */
+        const double from = hypot(x[0] / unit - expected[0], x[1] / unit - expected[1]);
+        if ((unit == 1e3 && from <= near)
+            || (too_far(controller, x, TOO_LONG) && from <= OTHER_UNITS * near_tip(controller))) {
+            return ODD_UNITS;
+        }
     }
     return ODD;
 }

@@ -1,6 +1,7 @@
 /* Which numbers a robot and its controller can have: those that Python's Robot, Limits and Tuning take. */
 #include <math.h>
 #include <stddef.h>
+#include <string.h>
 
 #include "pcr_parts.h"
 
@@ -35,17 +36,26 @@ int pcr_plant_refused_number(const double *numbers)
     return refused_number(numbers, pcr_plant_number_ranges, PCR_PLANT_NUMBERS, PCR_PLANT_ROD_NUMBERS);
 }
 
-/* Whether a terminal weight is symmetric, and no square of two states has a negative one, but for rounding. */
+/* Whether a terminal weight is symmetric and weighs nothing negatively, but for rounding: by Cholesky. */
 static int weighs(const double *terminal)
 {
-    for (int i = 0; i < PCR_STATES; i++) {
-        for (int j = 0; j <= i; j++) {
-            const double one = terminal[i + PCR_STATES * j], other = terminal[j + PCR_STATES * i];
-            const double own = terminal[i * (PCR_STATES + 1)], its = terminal[j * (PCR_STATES + 1)];
-            /* Product of the roots: the product itself could overflow in single precision. */
-            const double most = own >= 0.0 && its >= 0.0 ? 1.001 * sqrt(own) * sqrt(its) : -1.0;
-            if (!(fabs(one) <= most && fabs(one - other) <= 1e-3 * most)) {
+    double rest[PCR_STATES * PCR_STATES];
+    memcpy(rest, terminal, sizeof rest);
+    for (int k = 0; k < PCR_STATES; k++) {
+        const double own = terminal[k * (PCR_STATES + 1)], left = rest[k * (PCR_STATES + 1)];
+        if (!(left >= -1e-3 * own && own >= 0.0)) {
+            return 0;
+        }
+        for (int i = k + 1; i < PCR_STATES; i++) {
+            const double its = terminal[i * (PCR_STATES + 1)], one = terminal[i + PCR_STATES * k];
+            /* Roots: the product itself could overflow in single precision. */
+            const double most = its >= 0.0 ? sqrt(own) * sqrt(its) : -1.0;
+            if (!(fabs(one - terminal[k + PCR_STATES * i]) <= 1e-3 * most)
+                || (left <= 1e-3 * own && !(fabs(rest[i + PCR_STATES * k]) <= 0.04 * most))) {
                 return 0;
+            }
+            for (int j = k + 1; left > 1e-3 * own && j < PCR_STATES; j++) {
+                rest[j + PCR_STATES * i] -= rest[i + PCR_STATES * k] / sqrt(left) * (rest[j + PCR_STATES * k] / sqrt(left));
             }
         }
     }
@@ -58,6 +68,7 @@ static int none_or_positive(double limit)
     return isinf(limit) || limit >= 0.0;
 }
 
+/* Limits of poses that the scene does not have cannot be switched on: nothing watches them. */
 int pcr_refused_parameter(const pcr_parameters *p)
 {
     const double *all = (const double *)p, *refused = NULL;
@@ -81,15 +92,23 @@ int pcr_refused_parameter(const pcr_parameters *p)
     refused = p->rate > 0.0 ? refused : &p->rate;
     refused = p->rate_change > 0.0 ? refused : &p->rate_change;
     refused = p->reach > 0.0 && !isinf(p->reach) ? refused : &p->reach;
-    refused = p->torque > 0.0 ? refused : &p->torque;
-    refused = p->rod_margin <= MOST_MARGIN && none_or_positive(p->rod_margin) ? refused : &p->rod_margin;
-    refused = p->stiffness < INFINITY && none_or_positive(p->stiffness) ? refused : &p->stiffness;
+    refused = p->torque > 0.0 && (PCR_WATCHES_TORQUE || isinf(p->torque)) ? refused : &p->torque;
+    refused = p->rod_margin <= MOST_MARGIN && none_or_positive(p->rod_margin) && (PCR_WATCHES_MARGIN || isinf(p->rod_margin))
+                  ? refused
+                  : &p->rod_margin;
+    refused = p->stiffness < INFINITY && none_or_positive(p->stiffness) && (PCR_WATCHES_STIFFNESS || isinf(p->stiffness))
+                  ? refused
+                  : &p->stiffness;
     for (int i = 0; i < PCR_N; i++) {
         refused = p->angle_lower[i] <= p->angle_upper[i] ? refused : p->angle_lower + i;
-        refused = p->strain[i] > 0.0 && (p->strain[i] <= MOST_STRAINED || isinf(p->strain[i])) ? refused : p->strain + i;
+        /* How many rows a kind has is settled when the code is written. */
+        const int strained = p->strain[i] > 0.0 && (p->strain[i] <= MOST_STRAINED || isinf(p->strain[i]));
+        refused = strained && !isfinite(p->strain[i]) == !isfinite(pcr_scene_parameters.strain[i]) ? refused : p->strain + i;
     }
     for (int i = 0; i < 2; i++) {
-        refused = p->tip_lower[i] < p->tip_upper[i] ? refused : p->tip_lower + i;
+        refused = p->tip_lower[i] < p->tip_upper[i] && (PCR_WATCHES_TIP || isinf(p->tip_lower[i])) ? refused
+                                                                                                    : p->tip_lower + i;
+        refused = PCR_WATCHES_TIP || isinf(p->tip_upper[i]) ? refused : p->tip_upper + i;
     }
     return refused == NULL ? -1 : (int)(refused - all);
 }

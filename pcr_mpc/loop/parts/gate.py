@@ -21,6 +21,7 @@ _SURPRISE = 0.0125
 _TIP_ECHO, _ANGLE_ECHO = 3.0, 1.0
 _DEVIATIONS = 10.0  # of the sensor's noise, besides
 _TOO_LONG = 0.02  # of a rod's length, by which a tip may seem out of its reach: bases and lengths are not exact
+_OTHER_UNITS = 20.0  # of what surprises, or a quarter of a rod: so near would be a tip that is told in other units
 # A sensor that has said the same for so many periods in a row is right, and the expectation is wrong.
 PATIENCE = 30
 _TURN = 2 * math.pi
@@ -117,8 +118,8 @@ class Gate:
         Raises
         ------
         MeasurementError
-            The very first measurement cannot be: its tip is out of reach, as in millimetres or centimetres, or its
-            angles are degrees or whole turns off.
+            The very first measurement is in other units: its tip is out of reach, and would be near in millimetres or
+            centimetres, or its angles are degrees or whole turns off.
         """
         found = Sifted()
         told, due = x.tolist(), expected.tolist()  # on a few floats Python is faster than NumPy
@@ -186,7 +187,9 @@ class Gate:
             return f"{text}, expected ({ex:.6g}, {ey:.6g}) m: millimetres? give metres", True
         far = self._too_far(px, py, _TOO_LONG)
         if far:
-            return f"{text} is out of reach: {far}", True  # in centimetres, or seen from another place
+            # A reading that is merely wrong is bridged; in other units it would be somewhere near.
+            other = any(math.hypot(px / f - ex, py / f - ey) <= _OTHER_UNITS * self._near for f in (1e2, 1e3))
+            return f"{text} is out of reach{', are these centimetres or millimetres?' * other}: {far}", other
         return (
             f"{text} is {away:.3g} m from the expected ({ex:.6g}, {ey:.6g}) m, and cannot be further than {near:.3g} m",
             False,

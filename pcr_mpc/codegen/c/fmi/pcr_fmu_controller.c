@@ -81,7 +81,7 @@ static fmu_status decide(fmu *instance)
     memcpy(measured.q, in + FMU_Q, sizeof measured.q);
     const pcr_result result = pcr_controller_step(&state->part, &measured, &output);
     if (result != PCR_OK) {
-        return fmu_say(instance, FMU_ERROR, "at %.9g s: the first measurement, p = (%g, %g) m, is out of reach or in "
+        return fmu_say(instance, FMU_ERROR, "at %.9g s: the first measurement, p = (%g, %g) m, is in "
                        "other units, or angles are whole turns off (result %d)", state->time, measured.p[0], measured.p[1], (int)result);
     }
     show(instance, &output);
