@@ -228,7 +228,7 @@ class Foresight:
         Raises
         ------
         UnreachableError, ConvergenceError, UnstableError, ValueError
-            As `linearise`, at one of the places; the rods are then where they were.
+            As `linearise`, at one of the places; the rods are then where they were, or nearer to where they had to go.
         """
         self._graph()
         worst, self.strayed, *_ = self._decisions.tolist()
