@@ -68,6 +68,7 @@ def test_statics_three_ways(capsys, tmp_path):
     assert "0.927501" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_timing(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pcr_mpc.study.timing.stopwatch._INTERRUPTED", math.inf)  # however busy the machine is
     assert main(["timing", str(scene), "--steps", "60", "--json", "--out", str(tmp_path / "t")]) == 0
