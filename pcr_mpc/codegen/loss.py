@@ -33,6 +33,8 @@ class Loss:
         Periods of the same measurements in which rung or iterations differ.
     periods : int
         Of the run.
+    apart : float
+        Largest difference of a state of the plant alone, with the recorded rates [m, m/s or rad].
     """
 
     rms_mm: float
@@ -41,12 +43,13 @@ class Loss:
     same: float
     others: int
     periods: int
+    apart: float
 
     def __str__(self) -> str:
         return (
             f"RMS {self.rms_mm:.6g} mm, in double {self.double_rms_mm:.6g} mm; rates differ by at most "
             f"{self.rates:.2g} rad/s in closed loop, {self.same:.2g} for the same measurements; rung or iterations in "
-            f"{self.others} of {self.periods} periods"
+            f"{self.others} of {self.periods} periods; the plant alone by {self.apart:.2g} m, m/s or rad"
         )
 
 
@@ -78,12 +81,13 @@ def measure_loss(scene: str, write: Callable[[Path], None], double_rms_mm: float
     said = done.stdout
     numbers = re.findall(r"differ by at most (\S+) rad/s, rung or iterations in (\d+) of (\d+)", said)
     rms = re.search(r"RMS error of the tip\s+(\S+) mm", said)
-    if done.returncode or rms is None or len(numbers) != 2:
+    apart = re.search(r"plant, recorded rates\s+differs by at most (\S+) m", said)
+    if done.returncode or rms is None or apart is None or len(numbers) != 2:
         why = "; ".join(line for line in said.splitlines() if line) or f"status {done.returncode}"
         raise GenerationError(f"{scene}: in single precision it does not run to its end ({why}), where double has "
                               f"an RMS of {double_rms_mm:.6g} mm; leave --float32 out", part="float32")  # fmt: skip
     (rates, _, _), (same, others, periods) = numbers
-    loss = Loss(float(rms[1]), double_rms_mm, float(rates), float(same), int(others), int(periods))
+    loss = Loss(float(rms[1]), double_rms_mm, float(rates), float(same), int(others), int(periods), float(apart[1]))
     # So written that NaN is of no use.
     if not loss.rms_mm <= _WORST_RATIO * double_rms_mm + 1e3 * _SLIGHT * length:
         raise GenerationError(f"{scene}: single precision is of no use here ({loss}); leave --float32 out",

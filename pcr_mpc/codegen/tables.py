@@ -191,7 +191,8 @@ def _losses(subject: Subject, loss: Loss | None) -> dict[str, Any]:
     if loss is None:
         return dict(zip(names, (math.inf, math.inf, subject.scene.n_periods, math.inf), strict=True))
     # Another compiler rounds otherwise.
-    worst = 2 * abs(loss.rms_mm - loss.double_rms_mm), 2 * loss.same, 2 * loss.others + 1, math.inf
+    rms = max(2 * abs(loss.rms_mm - loss.double_rms_mm), 0.1 * loss.double_rms_mm)
+    worst = rms, 2 * loss.same, 2 * loss.others + 1, 2 * loss.apart
     return dict(zip(names, worst, strict=True))
 
 

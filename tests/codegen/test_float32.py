@@ -63,10 +63,12 @@ def test_what_single_precision_cannot_do_is_said():
     with pytest.raises(GenerationError, match=r"does not run to its end \(plant step 3: result 4; failed\)"):
         measure_loss("a scene", example("plant step 3: result 4", "failed", status=1), 0.1, 0.5)
     rates = ["rates differ by at most 0.1 rad/s, rung or iterations in 3 of 600 periods"]
-    runs = example("RMS error of the tip 9 mm", *rates, *rates)
+    plant = "plant, recorded rates differs by at most 1e-05 m, m/s or rad"
+    runs = example("RMS error of the tip 9 mm", *rates, *rates, plant)
     with pytest.raises(GenerationError, match="of no use here"):
         measure_loss("a scene", runs, 0.1, 0.5)
-    assert measure_loss("a scene", runs, 4.0, 0.5).others == 3
+    loss = measure_loss("a scene", runs, 4.0, 0.5)
+    assert (loss.others, loss.apart) == (3, 1e-5)
 
 
 @needs_compiler
@@ -87,6 +89,7 @@ def test_the_lemniscate_runs_in_single_precision(tmp_path, capsys):
     stated = json.loads(capsys.readouterr().out)["single"]
     assert 0.001 < stated["rms_mm"] < 0.003
     assert 1e-6 < stated["same"] < 0.01  # doubles would not differ
+    assert 1e-7 < stated["apart"] < 0.01
 
     subprocess.run(["make", "-s", "-C", str(folder), f"CC={CC}", *QUICK, "example"], check=True)
     done = subprocess.run([str(folder / "example")], capture_output=True, text=True, check=False)

@@ -34,6 +34,7 @@ from pcr_mpc.loop.references.tabulated import Tabulated
 from pcr_mpc.loop.references.trajectory import PickAndPlace, smooth_step
 from pcr_mpc.report.plan_table import plan_table
 from pcr_mpc.study.planning import rods_mass
+from pcr_mpc.study.planning.collocation import _narrowed
 from pcr_mpc.study.planning.course import paced
 from pcr_mpc.study.planning.free import way_points
 from pcr_mpc.study.planning.meshing import points
@@ -239,6 +240,12 @@ def test_slopes_are_those_of_differences(scene, pair):
         allowed = {"change of rate": 5e-2, "motor rate": 5e-3}.get(here.limit, 1e-3)
         assert np.abs(predicted - found).max() < allowed * np.abs(found).max(), here.limit
     assert {use.limit for use in start.uses} >= {"stiffness", "rod margin", "tip jerk", "motor torque"}
+
+
+def test_what_is_left_of_a_limit_is_left_on_both_sides():
+    low, high = _narrowed(np.array([-1.0, -np.inf, 0.0]), np.array([3.0, 2.0, np.inf]), 0.005)
+    assert low.tolist() == [-0.98, -np.inf, 0.0]
+    assert high.tolist() == [2.98, 2.0, np.inf]
 
 
 def test_a_closed_path_is_not_free():

@@ -186,16 +186,23 @@ def _row(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def _state_bounds(problem: Problem, count: int, allowed: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of the states at the ends of intervals, shape (K + 1, 4 + 2n)."""
+    """Of the states at the ends of intervals, shape (K + 1, 4 + 2n); between the ends a motion may bulge."""
     limits, robot = problem.limits, problem.pose.robot
     high = np.full((count + 1, 4 + 2 * robot.n_rods), np.inf)
     low = -high
-    low[:, 4 : 4 + robot.n_rods], high[:, 4 : 4 + robot.n_rods] = robot.angle_limits.T
+    (least, most), left = robot.angle_limits.T, (1.0 - allowed) / 2.0
+    low[:, 4 : 4 + robot.n_rods], high[:, 4 : 4 + robot.n_rods] = _narrowed(least, most, left)
     high[:, 4 + robot.n_rods :] = allowed * limits.rate
     low[:, 4 + robot.n_rods :] = -allowed * limits.rate
     if limits.tip_lower is not None and limits.tip_upper is not None:
-        low[:, :2], high[:, :2] = limits.tip_lower, limits.tip_upper
+        low[:, :2], high[:, :2] = _narrowed(np.asarray(limits.tip_lower), np.asarray(limits.tip_upper), left)
     return low, high
+
+
+def _narrowed(low: np.ndarray, high: np.ndarray, left: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of which a share is left on either side; what is open on one side has no width to take it from."""
+    room = left * np.where(np.isfinite(high - low), high - low, 0.0)
+    return low + room, high - room
 
 
 def _interval(problem: Problem, hands: tuple[float, ...], kinds: frozenset[str]) -> tuple[Any, np.ndarray]:
