@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,13 +124,13 @@ class GeneratedController:
         if code := self._code.pcr_controller_set_parameters(self._at, (self._real * len(flat))(*flat)):
             raise PCRError(f"the generated controller refuses these parameters: result {code}")
 
-    def raw_step(self, x: np.ndarray) -> int:
+    def raw_step(self, x: Sequence[float] | np.ndarray) -> int:
         """Decide from a measured state; return the result, with ``output`` filled."""
         self._measured.p[:], self._measured.v[:], self._measured.q[:] = x[:2], x[2:4], x[4:]
         return int(self._code.pcr_controller_step(self._at, ctypes.byref(self._measured), ctypes.byref(self.output)))
 
-    def step(self, k: int, x: np.ndarray) -> Decision:
-        """See `Controller`.
+    def checked_step(self, x: Sequence[float] | np.ndarray) -> None:
+        """Decide from a measured state; what is decided is in ``output``.
 
         Raises
         ------
@@ -143,6 +144,10 @@ class GeneratedController:
             raise MeasurementError(f"first measurement: {x} is in other units, or wrapped")
         if code:
             raise PCRError(f"the generated controller failed: result {code} of pcr_controller_step; was it started?")
+
+    def step(self, k: int, x: np.ndarray) -> Decision:
+        """See `Controller`; errors as `checked_step`."""
+        self.checked_step(x)
         out = self.output
         status, rung = _SOLVED[out.solver], RUNGS[out.rung]
         states = np.array(out.states)

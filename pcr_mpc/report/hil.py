@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..wire.hil import HilRun
-from .style import BLUE, GREY, ORANGE, RED, plt, save_figure
+from .style import BLUE, GREY, ORANGE, PURPLE, RED, plt, save_figure
 from .tables import table
+
+_SAME = 1e-9  # mm, that another machine's rounding may differ by
+_REMARKABLE = 0.25  # of a period
+_OFTEN = 0.25  # of a period, that the mean may be above what most commands take
 
 
 def hil_table(summary: dict[str, Any]) -> str:
@@ -20,20 +25,48 @@ def hil_table(summary: dict[str, Any]) -> str:
         for label, key in (("round trip", "round_trip_us"), ("plant step later than due", "plant_late_us"))
     ]
     server = ", ".join(f"{count} {name}" for name, count in summary["server"].items())
-    return "\n".join(
-        [
-            f"scene       {summary['scene']}, {summary['duration_s']:g} s in real time",
-            f"error       RMS {summary['rms_mm']:.5g} mm, at most {summary['max_mm']:.5g} mm",
-            f"simulated   RMS {summary['simulated_rms_mm']:.5g} mm, with commands {summary['simulated_delay_ms']:g} ms "
-            "later than told",
-            f"processes   with {summary['priority']} priority",
-            f"commands    {summary['missed']} of {summary['periods']} missed their period of "
-            f"{1e3 * summary['period_s']:g} ms, {summary['fallbacks']} by a lower rung",
-            f"server      {server}",
-            "",
-            table(("[us]", *names), rows),
-        ]
-    )
+    stood = f"; its clock stood still for {summary['stood_still_s']:.3g} s" if summary["stood_still_s"] else ""
+    lines = [
+        f"scene       {summary['scene']}, {summary['duration_s']:g} s in real time{stood}",
+        f"error       RMS {summary['rms_mm']:.5g} mm, at most {summary['max_mm']:.5g} mm",
+        f"simulated   {_rms(summary['simulated_rms_mm'])}, every command {summary['simulated_delay_ms']:.3g} ms later "
+        "than told",
+        f"            {_rms(summary['replayed_rms_mm'])}, every command as late as it was" + _apart(summary),
+        f"processes   with {summary['priority']} priority",
+        f"commands    {summary['missed']} of {summary['periods']} missed their period of "
+        f"{1e3 * summary['period_s']:g} ms, {summary['fallbacks']} by a lower rung",
+        f"server      {server}",
+        "",
+        table(("[us]", *names), rows),
+    ]
+    return "\n".join([*lines, *_remark(summary)])
+
+
+def _remark(summary: dict[str, Any]) -> list[str]:
+    """What would help where commands come much later than the controller knows."""
+    late, period = summary["simulated_delay_ms"], 1e3 * summary["period_s"]
+    if late <= _REMARKABLE * period:
+        return []
+    told = summary["told_delay"] + max(1, math.ceil(late / period - _OFTEN))
+    return [
+        "",
+        f"Commands come {late:.3g} ms later than the controller knows, {late / period:.2g} of its period. With",
+        f"`[control] delay = {told}` in the scene it reckons with it, and each acts {told} "
+        f"period{'s' if told > 1 else ''} after its measurement.",
+    ]
+
+
+def _rms(value: float | None) -> str:
+    return "not had" if value is None else f"RMS {value:.5g} mm"
+
+
+def _apart(summary: dict[str, Any]) -> str:
+    apart = summary["replayed_apart_mm"]
+    if apart is None:
+        return ""
+    if apart > _SAME:
+        return f"; its tip is up to {apart:.2g} mm elsewhere: the wire adds more than latency"
+    return "; the same motion" + (f", to {apart:.1g} mm" if apart else ", bit for bit")
 
 
 def plot_hil(run: HilRun, path: Path) -> None:
@@ -41,9 +74,11 @@ def plot_hil(run: HilRun, path: Path) -> None:
     figure, (error, trips, late) = plt.subplots(3, 1, figsize=(9, 7.5), layout="constrained")
     summary = run.summary()
     error.plot(run.t, 1e3 * run.error, color=BLUE, lw=0.9)
-    error.axhline(summary["simulated_rms_mm"], color=ORANGE, ls="--", lw=1.0,
-                  label=f"simulated with commands {summary['simulated_delay_ms']:g} ms late: RMS "
-                  f"{summary['simulated_rms_mm']:.3g} mm")  # fmt: skip
+    error.plot(run.t, 1e3 * run.replayed, color=PURPLE, lw=0.9, ls=":",
+               label=f"simulated, commands as late as they were: {_rms(summary['replayed_rms_mm'])}")  # fmt: skip
+    error.axhline(1e3 * run.simulated, color=ORANGE, ls="--", lw=1.0,
+                  label=f"simulated, commands {summary['simulated_delay_ms']:.3g} ms late: "
+                  f"{_rms(summary['simulated_rms_mm'])}")  # fmt: skip
     error.set(xlim=(0.0, run.t[-1]), ylim=(0.0, None), xlabel="time [s]", ylabel="error of the tip [mm]")
     error.set_title(f"{run.scene.name} over a wire: RMS {summary['rms_mm']:.3g} mm")
     error.legend(loc="upper left")

@@ -24,6 +24,12 @@ _RUNGS = {None: 0, "softened": 1, "shifted_plan": 2, "lqr": 3, "hold": 4}
 # As far from the start of the scene a robot still stands there, in lengths of the shortest rod and in rad.
 _NEAR, _TURNED = 0.0125, 0.05
 _LONGEST_GAP = 100  # periods that a generated controller bridges
+_AT_REST = 1e-12  # rad/s
+
+
+def at_rest(command: Command) -> bool:
+    """Whether a command holds the motors."""
+    return float(np.abs(command.u).max()) <= _AT_REST
 
 
 class Decider(ABC):
@@ -160,6 +166,7 @@ class GeneratedDecider(Decider):
             write_folder(subject, None, Path(folder))
             self._controller = GeneratedController(build(Path(folder)), subject)
         self._zero, self._k = 0.0, -1
+        self._nothing = [math.nan] * (4 + self.n)
         self.stop()
 
     def _restart(self) -> None:
@@ -177,13 +184,12 @@ class GeneratedDecider(Decider):
         k = max(self._k + 1, round((found.time - self._zero) / self.period))
         if k - self._k > _LONGEST_GAP:
             raise PCRError(f"{k - self._k} periods without a measurement")
-        nothing = np.full(4 + self.n, np.nan)
-        for missed in range(self._k + 1, k):
-            self._controller.step(missed, nothing)
-        decision = self._controller.step(k, np.concatenate([found.p, [0.0, 0.0], found.q]))
-        self._k, out, plan = k, self._controller.output, decision.plan
-        assert plan is not None
-        return Command(found.sequence, found.time, decision.u, _RUNGS[plan.fallback], out.doubts & 3, plan.iterations,
+        controller = self._controller
+        for _ in range(self._k + 1, k):
+            controller.raw_step(self._nothing)
+        controller.checked_step([*found.p.tolist(), 0.0, 0.0, *found.q.tolist()])
+        self._k, out = k, controller.output
+        return Command(found.sequence, found.time, np.array(out.u), out.rung, out.doubts & 3, out.iterations,
                        out.stiffness, np.array(out.torque))  # fmt: skip
 
 

@@ -43,7 +43,7 @@ class Hardware:
         self._pictures = None if scene.camera in (None, IDEAL) else Pictures(scene.camera, self.dt, 0)
         carried = scene.carried(self.dt * np.arange(self.steps)) * (scene.plant.payload == "carried")
         self._payloads = {int(k): float(carried[k]) for k in np.flatnonzero(np.diff(carried, prepend=0.0))}
-        self._coming: deque[tuple[int, np.ndarray]] = deque()
+        self._coming: deque[tuple[float, np.ndarray]] = deque()
         self._u = np.zeros(n)
         self._done = 0
         self.states = np.empty((self.steps + 1, 4 + n))
@@ -66,15 +66,36 @@ class Hardware:
             q = q - 2 * np.pi * np.ceil(q / (2 * np.pi) - 0.5)
         return Measurement(k, k * scene.period, p, q)
 
-    def told(self, u: np.ndarray) -> None:
-        """Take in rates that have come [rad/s]; they act after the scene's delay."""
-        self._coming.append((self._done + self._scene.delay * self._per, u))
+    def told(self, u: np.ndarray, at: float, since: float) -> None:
+        """Take in rates that come at a time [steps], and answer what was measured ``since`` [steps].
+
+        They act when they come, or by the scene's delay after the measurement, whichever is later.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n,)
+            [rad/s].
+        at, since : float
+            Of the plant's steps; not before what has been done.
+        """
+        before = self._coming[-1][0] if self._coming else 0.0
+        self._coming.append((max(at, since + self._scene.delay * self._per, before), u))
+
+    def _turning(self) -> np.ndarray:
+        """Mean rates over the step that comes next: every motor turns by what it must, whenever a command acts."""
+        if not self._coming or self._coming[0][0] >= self._done + 1:
+            return self._u
+        mean, last = np.zeros(len(self._u)), float(self._done)
+        while self._coming and self._coming[0][0] < self._done + 1:
+            at, u = self._coming.popleft()
+            mean = mean + (max(at, last) - last) * self._u
+            last, self._u = max(at, last), u
+        # A command that acts from the beginning on is the rates, to the last bit.
+        return self._u if last == self._done else mean + (self._done + 1 - last) * self._u
 
     def step(self) -> None:
         """Advance the plant; errors as `Plant.step`."""
-        while self._coming and self._coming[0][0] <= self._done:
-            self._u = self._coming.popleft()[1]
-        x, u = self.states[self._done], self._later(self._u)
+        x, u = self.states[self._done], self._later(self._turning())
         if self._done in self._payloads:
             x = self._plant.carry(self._payloads[self._done], x)
         if self._drive is not None:

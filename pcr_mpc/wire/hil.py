@@ -4,33 +4,27 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
-import select
-import socket
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
 from .. import interrupt
-from ..errors import PCRError, SimulationError
+from ..errors import PCRError
 from ..loop.controller.make_controller import make_controller
 from ..loop.run.simulate import simulate
 from ..loop.scene.scene import Scene
 from ..study.episodes.parallel import follow_the_parent
-from .hardware import Hardware
-from .packet import RESTING, command_size, pack_measurement, unpack_command
+from .happened import replayed
+from .real_time import preferred, run_plant
 
+_T = TypeVar("_T")
 _PATIENCE = 120.0  # s, until the controller's process has ended
-_GREETING = 10.0  # s, until the first measurement is answered
 _SILENCE, _SILENCE_TIME = 5, 0.25  # periods at least, and s
-_SPIN = 1e-4  # s before a step is due, in which sleeping is too coarse
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +39,22 @@ class HilRun:
     t, error : ndarray, shape (K + 1,)
         Times, and the tip's distance from the reference [s], [m].
     late : ndarray, shape (K,)
-        How much later than due each plant step began [s].
+        How much later than due each plant step was done [s].
     round_trip : ndarray, shape (M,)
         From a measurement to its command, as far as they came [s]; NaN for those that did not come within their period.
         The first period is left out: the clock starts when its command has come.
     rungs : ndarray, shape (M,)
         Of the commands, -1 for those that did not come.
+    stood : float
+        For how long the robot's clock stood still, for its process was held up [s].
     simulated : float
         RMS error of the simulated loop whose commands come later than told by the mean of what these did [m].
     simulated_delay : float
         That delay [s].
+    replayed : ndarray, shape (K + 1,)
+        Error of the loop without a wire in which the same measurements are answered and commands act when they did [m].
+    apart : float
+        How far its tip came from that of the loop over the wire [m].
     counts : dict
         Of the server.
     priority : {"real-time", "normal"}
@@ -68,8 +68,11 @@ class HilRun:
     late: np.ndarray
     round_trip: np.ndarray
     rungs: np.ndarray
+    stood: float
     simulated: float
     simulated_delay: float
+    replayed: np.ndarray
+    apart: float
     counts: dict[str, int]
     priority: str
 
@@ -79,26 +82,38 @@ class HilRun:
         return int(np.isnan(self.round_trip).sum())
 
     def summary(self) -> dict[str, Any]:
-        """Figures of the run, times in us."""
+        """Figures of the run, times in us; None for what could not be simulated."""
         came = self.round_trip[~np.isnan(self.round_trip)]
-        rms = 1e3 * float(np.sqrt(np.mean(self.error**2)))
         return {
             "scene": self.scene.name,
             "duration_s": float(self.t[-1]),
             "period_s": self.scene.period,
             "plant_step_s": self.dt,
-            "rms_mm": rms,
+            "told_delay": self.scene.delay,
+            "rms_mm": _rms_mm(self.error),
             "max_mm": 1e3 * float(self.error.max()),
-            "simulated_rms_mm": 1e3 * self.simulated,
+            "simulated_rms_mm": _number(1e3 * self.simulated),
             "simulated_delay_ms": 1e3 * self.simulated_delay,
+            "replayed_rms_mm": _number(_rms_mm(self.replayed)),
+            "replayed_apart_mm": _number(1e3 * self.apart),
             "round_trip_us": _percentiles(came),
             "plant_late_us": _percentiles(self.late),
             "periods": len(self.round_trip),
             "missed": self.missed,
+            "stood_still_s": self.stood,
             "fallbacks": int((self.rungs > 0).sum()),
             "priority": self.priority,
             "server": self.counts,
         }
+
+
+def _rms_mm(error: np.ndarray) -> float:
+    return 1e3 * float(np.sqrt(np.mean(error**2)))
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return value if math.isfinite(value) else None
 
 
 def _percentiles(times: np.ndarray) -> dict[str, float]:
@@ -127,35 +142,38 @@ def run_hil(scene: Scene, *, generated: bool = False, progress: bool = False) ->
     try:
         # As long as it takes: C of a long scene is generated and compiled.
         address = _expected(ours, process, math.inf)
-        with _preferred() as priority:
-            plant_log = _plant(scene, address, progress=progress)
+        with preferred() as priority:
+            log = run_plant(scene, address, progress=progress)
         ours.send("end")
         counts = _expected(ours, process, _PATIENCE)
+        # In that process, which has the controller, while the other simulation runs in this one.
+        ours.send(log.happened)
+        late = scene.plant.dt * log.happened.lateness(round(scene.period / scene.plant.dt), scene.delay)
+        delay = float(late.mean()) if len(late) else 0.0
+        simulated = _tried(lambda: _simulated(scene, delay), math.nan)
+        states = _tried(lambda: _expected(ours, process, math.inf), np.full_like(log.states, np.nan))
     finally:
         if process.is_alive():
             process.join(2.0)
         if process.is_alive():
             process.terminate()
-    t, error, late, round_trip, rungs, dt = plant_log
-    came = round_trip[~np.isnan(round_trip)]
-    # A command acts at the first step that begins after it has come.
-    delay = dt * float(np.mean(np.ceil(came / dt))) if len(came) else 0.0
-    return HilRun(scene, dt, t, error, late, round_trip, rungs, _simulated(scene, delay), delay, counts, priority)
+    t = scene.plant.dt * np.arange(len(log.states))
+    assert scene.trajectory is not None
+    wanted = scene.trajectory(t)[:, 0]
+    error, again = (np.hypot(*(each[:, :2] - wanted).T) for each in (log.states, states))
+    apart = float(np.hypot(*(log.states - states)[:, :2].T).max())
+    return HilRun(scene, scene.plant.dt, t, error, log.late, log.round_trip[1:], log.rungs[1:], log.stood, simulated,
+                  delay, again, apart, counts, priority)  # fmt: skip
 
 
-@contextmanager
-def _preferred() -> Iterator[str]:
-    """Be scheduled before all that is not in real time, where that is allowed; says which priority it is."""
+def _tried(call: Callable[[], _T], instead: _T) -> _T:
+    """What a simulation comes to: where it fails, the run that it is compared with is not lost."""
     try:
-        before = os.sched_getscheduler(0)
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    except (AttributeError, OSError):  # another system, or not allowed
-        yield "normal"
-        return
-    try:
-        yield "real-time"
-    finally:
-        os.sched_setscheduler(0, before, os.sched_param(0))
+        return call()
+    except (PCRError, ValueError) as error:
+        interrupt.pass_on(error)
+        print(f"warning: there is nothing to compare with: {error}", file=sys.stderr)
+        return instead
 
 
 def _expected(pipe: Connection, process: Any, patience: float) -> Any:
@@ -181,94 +199,21 @@ def _controller(scene: Scene, generated: bool, pipe: Connection) -> None:
     # A process that is kept waiting by others, a tenth of a second now and then, has not fallen silent.
     silence = max(_SILENCE, math.ceil(_SILENCE_TIME / scene.period))
     try:
-        server = Server(make_decider(scene, generated=generated), ("127.0.0.1", 0), silence=silence)
+        decider = make_decider(scene, generated=generated)
+        server = Server(decider, ("127.0.0.1", 0), silence=silence)
     except Exception as error:  # whatever it is, who waits is told
         pipe.send(error)
         return
-    with _preferred():
+    with preferred():
         pipe.send(server.address)
         server.serve(lambda text: print(f"{scene.name}: {text}", file=sys.stderr), until=pipe.poll)
     server.close()
+    pipe.recv()
     pipe.send(dict(server.counts))
-
-
-def _plant(scene: Scene, address: tuple[str, int], *, progress: bool) -> tuple[Any, ...]:
-    """Step the plant by the clock; commands act at the first step after they have come, or as much later as the scene
-    says."""
-    robot, n = Hardware(scene), scene.robot.n_rods
-    count, per = robot.steps, round(scene.period / robot.dt)
-    t, late = robot.dt * np.arange(count + 1), np.empty(count)
-    assert scene.trajectory is not None
-    wanted = scene.trajectory(t)[:, 0]
-    sent = np.full(scene.n_periods, np.nan)
-    round_trip, rungs = np.full(scene.n_periods, np.nan), np.full(scene.n_periods, -1)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
-        wire.connect(address)
-        wire.setblocking(False)
-        robot.told(_greeted(wire, pack_measurement(robot.measured(0)), n))
-        bar = tqdm(total=scene.n_periods, desc=scene.name, unit="period", disable=not progress)
-        began = time.perf_counter()
-        for step in range(count):
-            due = began + step * robot.dt
-            for data, now in _until(due, wire, command_size(n) + 1):
-                command = unpack_command(data, n)
-                if command is None or command.sequence >= len(sent):
-                    continue
-                robot.told(command.u)
-                k = command.sequence
-                if command.rung != RESTING and k == (step - 1) // per:
-                    round_trip[k], rungs[k] = now - sent[k], command.rung
-            late[step] = time.perf_counter() - due
-            if step % per == 0:
-                interrupt.check()
-                if k := step // per:
-                    data = pack_measurement(robot.measured(k))
-                    sent[k] = time.perf_counter()
-                    _quietly(wire.send, data)
-                bar.update()
-            try:
-                robot.step()
-            except PCRError as error:
-                raise SimulationError(
-                    f"{scene.name}: the plant failed at {t[step]:.3f} s: {error}", t=t[step]
-                ) from error
-        bar.close()
-    return t, np.hypot(*(robot.states[:, :2] - wanted).T), late, round_trip[1:], rungs[1:], robot.dt
-
-
-def _greeted(wire: socket.socket, first: bytes, n: int) -> np.ndarray:
-    """Rates that answer the first measurement: the reference begins with it, so the robot rests until they come."""
-    _quietly(wire.send, first)
-    end = time.perf_counter() + _GREETING
-    while time.perf_counter() < end:
-        interrupt.check()
-        select.select([wire], [], [], 0.1)
-        data = _quietly(wire.recv, command_size(n) + 1)
-        command = None if data is None else unpack_command(data, n)
-        if command is not None and command.rung != RESTING:
-            return command.u
-    raise PCRError(f"the first measurement is not answered for {_GREETING:g} s; try `pcr-mpc serve` to see why")
-
-
-def _until(due: float, wire: socket.socket, size: int) -> Iterator[tuple[bytes, float]]:
-    """Datagrams that come until a time, and when each came; the last moments are waited for awake."""
-    while True:
-        data = _quietly(wire.recv, size)
-        now = time.perf_counter()
-        if data is not None:
-            yield data, now
-        elif now >= due:
-            return
-        elif due - now > _SPIN:
-            select.select([wire], [], [], due - now - _SPIN)
-
-
-def _quietly(call: Any, *arguments: Any) -> Any:
-    """Result of a call of a socket that does not wait; None where there is nothing, or nobody there."""
     try:
-        return call(*arguments)
-    except OSError:
-        return None
+        pipe.send(replayed(scene, decider, pipe.recv()))
+    except Exception as error:
+        pipe.send(error)
 
 
 def _simulated(scene: Scene, delay: float) -> float:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+import select
 import socket
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from ipaddress import ip_address
 
 from .. import interrupt
 from ..errors import OutputError, PCRError
-from .decider import Decider
+from .decider import Decider, at_rest
 from .packet import Measurement, command_size, measurement_size, newer, pack_command, unpack_measurement
 
-_AT_REST = 1e-12  # rad/s
+_ASKED = 0.05  # s, between looks at whether it is over
+_QUICK = 0.5  # of a period, in which an answer is reckoned: then those who wait can all be answered
 _QUEUE = 100  # datagrams that are read at once
 
 
@@ -86,13 +88,14 @@ class Server:
         self, decider: Decider, address: tuple[str, int], *, silence: int = 5, anywhere: bool = False
     ) -> None:  # fmt: skip
         self._socket = _bound(address, anywhere=anywhere)
+        self._socket.setblocking(False)
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
         self.counts: Counter[str] = Counter()
         self.problem = ""
         self._decider, self._silence = decider, silence
         self._peer: tuple[str, int] | None = None
         self._last: Measurement | None = None
-        self._resting = False
+        self._resting, self._spent = False, deque([0.0], maxlen=3)
         self._size = max(measurement_size(decider.n), command_size(decider.n)) + 1
 
     def close(self) -> None:
@@ -122,8 +125,11 @@ class Server:
         self.counts["answered"] += 1
         if self._resting:
             return self._brake()
+        began = time.thread_time()  # not what it waits for other processes
         try:
-            return pack_command(self._decider.answer(found))
+            answer = pack_command(self._decider.answer(found))
+            self._spent.append(time.thread_time() - began)
+            return answer
         except (PCRError, ValueError) as error:
             self.problem = str(error)
             self.counts["failures"] += 1
@@ -143,16 +149,21 @@ class Server:
         """Command of a period in which the motors come to rest; where they are, whoever comes next is served."""
         assert self._last is not None
         command = self._decider.rest(self._last.sequence, self._last.time)
-        if float(abs(command.u).max()) <= _AT_REST:
+        if at_rest(command):
             self._decider.stop()
             self._peer, self._last, self._resting = None, None, False
         return pack_command(command)
 
     def serve(self, tell: Callable[[str], None] = print, *, until: Callable[[], bool] = lambda: False) -> None:
-        """Serve until Ctrl-C; ``until`` is asked once a period."""
+        """Serve until Ctrl-C; ``until`` is asked now and then."""
         period, heard = self._decider.period, time.monotonic()
-        while not until():
+        asked = -_ASKED
+        while True:
             interrupt.check()
+            if (now := time.monotonic()) - asked >= _ASKED:
+                asked = now
+                if until():
+                    return
             left = (
                 period
                 if self._peer is None
@@ -165,28 +176,33 @@ class Server:
                 if began:
                     tell(f"nothing measured for {self._silence} periods: the motors are brought to rest")
                 continue
-            found = self._newest(min(period, left))
-            if found is None:
-                continue
-            peer, failures, heard = self._peer, self.counts["failures"], time.monotonic()
-            self._send(self._answer(found), peer)
-            if self.counts["failures"] > failures:
-                tell(f"no answer, the motors are brought to rest: {self.problem}")
+            for found in self._waiting(min(period, left)):
+                peer, failures, heard = self._peer, self.counts["failures"], time.monotonic()
+                self._send(self._answer(found), peer)
+                if self.counts["failures"] > failures:
+                    tell(f"no answer, the motors are brought to rest: {self.problem}")
 
-    def _newest(self, wait: float) -> Measurement | None:
-        """The last of the measurements that have come, waiting for the first; those before it are too late."""
-        found = None
-        self._socket.settimeout(wait)
+    def _waiting(self, wait: float) -> list[Measurement]:
+        """Measurements that have come and are to be answered, waiting for the first.
+
+        A controller that knows all measurements, late as they may be, is in time again after a burst; one that is too
+        slow for that answers the last alone.
+        """
+        found: list[Measurement] = []
+        if not select.select([self._socket], [], [], wait)[0]:
+            return found
         for _ in range(_QUEUE):
             try:
                 data, sender = self._socket.recvfrom(self._size)
             except OSError:  # nobody has spoken; or nobody has taken the last answer, which some systems tell here
                 break
-            self._socket.settimeout(0.0)
             later = self._accepted(data, sender[:2])
-            self.counts["skipped"] += found is not None and later is not None
-            found = later or found
-        return found
+            if later is not None:
+                found.append(later)
+        if len(found) < 2 or min(self._spent) < self._decider.period * _QUICK:
+            return found
+        self.counts["skipped"] += len(found) - 1
+        return found[-1:]
 
     def _send(self, answer: bytes | None, peer: tuple[str, int] | None) -> None:
         if answer is None or peer is None:

@@ -22,10 +22,11 @@ from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.parts.assembled import resting_state
 from pcr_mpc.loop.run.simulate import simulate
 from pcr_mpc.loop.scene.file import load_scene
-from pcr_mpc.wire import hil
+from pcr_mpc.wire import hil, real_time
 from pcr_mpc.wire.decider import make_decider
+from pcr_mpc.wire.happened import Arrival, Happened, replayed
 from pcr_mpc.wire.hardware import Hardware
-from pcr_mpc.wire.hil import _plant, run_hil
+from pcr_mpc.wire.hil import run_hil
 from pcr_mpc.wire.packet import (
     RESTING,
     Command,
@@ -38,6 +39,7 @@ from pcr_mpc.wire.packet import (
     unpack_command,
     unpack_measurement,
 )
+from pcr_mpc.wire.real_time import run_plant
 from pcr_mpc.wire.server import Server
 from tests.conftest import ROOT
 
@@ -239,11 +241,12 @@ def test_the_clock_waits_for_the_first_command():
         server.settimeout(10.0)
         thread = threading.Thread(target=answer, args=(server,))
         thread.start()
-        t, _, late, round_trip, _, _ = _plant(scene, server.getsockname(), progress=False)
+        log = run_plant(scene, server.getsockname(), progress=False)
         thread.join()
     assert heard[:2] == [(0, 0.0), (1, pytest.approx(scene.period))]
-    assert (len(t), len(late), len(round_trip)) == (26, 25, 4)
-    assert np.isfinite(round_trip).any()
+    assert (len(log.states), len(log.late), len(log.round_trip)) == (26, 25, 5)
+    assert np.isfinite(log.round_trip).any()
+    assert log.happened.arrivals[0] == (0.0, 0, False)
 
 
 def test_a_controller_may_take_long_to_get_ready():
@@ -265,16 +268,20 @@ def test_a_controller_may_take_long_to_get_ready():
 
 
 def test_a_server_that_is_silent_is_told(monkeypatch):
-    monkeypatch.setattr(hil, "_GREETING", 0.05)
+    monkeypatch.setattr(real_time, "_GREETING", 0.05)
     scene = replace(load_scene(ROOT / "models" / "scenes" / "hold_slow.toml"), duration=0.05)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind(("127.0.0.1", 0))
         with pytest.raises(PCRError, match=r"not answered for 0.05 s; try `pcr-mpc serve`"):
-            _plant(scene, deaf.getsockname(), progress=False)
+            run_plant(scene, deaf.getsockname(), progress=False)
 
 
-def test_hardware_in_real_time_is_late_as_in_a_simulation():
-    """The same commands, one a period, lead to the same states, and the same is measured."""
+@pytest.mark.parametrize("inside", [0.0, 3.7])
+def test_hardware_in_real_time_is_late_as_in_a_simulation(inside):
+    """The same commands, one a period, lead to the same states, and the same is measured; they may come within a step.
+
+    What is late by a scene's own figure in the one run comes late in the other.
+    """
     scene = replace(
         load_scene(ROOT / "models" / "scenes" / "servo.toml"),
         duration=0.12,
@@ -293,15 +300,71 @@ def test_hardware_in_real_time_is_late_as_in_a_simulation():
             return told[k]
 
     run = simulate(scene, scene.make_plant(), Given(), 0)
-    robot = Hardware(scene)
+    robot = Hardware(replace(scene, untold_delay=0.0) if inside else scene)
     for k, u in enumerate(told):
         found = robot.measured(k)
-        np.testing.assert_array_equal([*found.p, *found.q], run.measured[k][[0, 1, 4, 5]])
-        robot.told(u)
+        wanted = run.measured[k][[0, 1, 4, 5]]
+        np.testing.assert_allclose([*found.p, *found.q], wanted, rtol=0.0, atol=1e-12 * (inside > 0.0))
+        robot.told(u, 10 * k + (20 + inside if inside else 0), 10 * k)
         for _ in range(10):
             robot.step()
-    np.testing.assert_array_equal(robot.states, run.x)
+    np.testing.assert_allclose(robot.states, run.x, rtol=0.0, atol=1e-11 * (inside > 0.0))
     assert np.abs(run.x[-1, 4:] - run.x[0, 4:]).max() > 1e-3  # it has moved
+
+
+def test_commands_that_come_within_one_step_turn_the_motors_by_what_they_must():
+    robot = Hardware(replace(load_scene(ROOT / "models" / "scenes" / "hold_slow.toml"), duration=0.04))
+    before = robot.states[0, 4:].copy()
+    for at, u in ((0.25, 1.0), (0.5, -2.0), (1.0, 0.5)):
+        robot.told(np.full(2, u), at, at)
+    robot.step()
+    robot.step()
+    turned = robot.dt * np.array([0.25 * 1.0 + 0.5 * -2.0, 0.5])
+    np.testing.assert_allclose(np.diff([before[0], *robot.states[1:3, 4]]), turned, rtol=0.0, atol=1e-15)
+
+
+def test_all_that_wait_are_answered_in_their_order_by_a_controller_that_keeps_up(server):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        wire.connect(server.address)
+        for first, spent, expected in ((0, 0.0049, [0, 1, 2]), (3, 0.0051, [5])):
+            server._spent.extend([spent] * 3)
+            for sequence in range(first, first + 3):
+                wire.send(measurement(sequence))
+            time.sleep(0.01)
+            assert [each.sequence for each in server._waiting(1.0)] == expected
+    assert server.counts == {"skipped": 2}
+
+
+def test_what_happened_is_what_the_loop_without_a_wire_does():
+    """Late, lost, doubled and resting commands; one that came a tenth of a step later moves the robot elsewhere."""
+    scene = replace(load_scene(ROOT / "models" / "scenes" / "lemniscate.toml"), duration=0.12)
+    decider = make_decider(scene, generated=False)
+    server, robot, happened = Server(decider, ("127.0.0.1", 0)), Hardware(scene), Happened()
+    per = robot.steps // scene.n_periods
+    waiting = {}
+
+    def answered(data, at):
+        if data is not None:  # nobody is served once the motors rest
+            waiting.setdefault(int(at), []).append((unpack_command(data, 2), at))
+
+    for step in range(robot.steps):
+        if step % per == 0 and (k := step // per) not in (5, 6):
+            found = robot.measured(k)
+            answered(server.take(pack_measurement(found), ME), step + (0.0, 0.4, 7.3)[k % 3])
+        elif step % per == 0:
+            robot.measured(step // per)
+            answered(server.wait(), step + 0.5)
+        for command, at in waiting.pop(step, ()):
+            arrival = Arrival.of(command, at)
+            happened.arrivals.append(arrival)
+            robot.told(command.u, at, arrival.since(per))
+        robot.step()
+    server.close()
+    assert {each.rests for each in happened.arrivals} == {True, False}
+    np.testing.assert_array_equal(replayed(scene, decider, happened), robot.states)
+    first = happened.arrivals[1]
+    happened.arrivals[1] = first._replace(at=first.at + 0.1)
+    assert np.abs(replayed(scene, decider, happened) - robot.states).max() > 1e-9
 
 
 @pytest.mark.slow
@@ -312,4 +375,7 @@ def test_a_loop_in_real_time_says_what_it_was():
     # The greeting is answered too.
     assert found["server"]["answered"] + found["server"].get("skipped", 0) <= found["periods"] + 1
     assert found["missed"] < found["periods"]
+    # What the wire adds is latency, and nothing else.
+    assert found["replayed_apart_mm"] == 0.0
+    assert found["replayed_rms_mm"] == found["rms_mm"]
     assert found["max_mm"] < 20.0  # it holds, and shifts; how well depends on the machine
