@@ -20,6 +20,7 @@ from pcr_mpc import (
     simulate,
 )
 from pcr_mpc.loop.references.trajectory import Hold
+from pcr_mpc.plant.statics.solver import RodSolver
 from tests.conftest import CONTROLLERS, MODELS
 
 PERIOD = 0.01
@@ -125,6 +126,17 @@ def test_jitter_and_late_calls(live, centre, scene):
         loop.wait(10 * (k + 1) + int(rng.integers(-2, 3)) - round(1e3 * loop.t))
     assert loop.error(scene.trajectory, 100) < 0.1
     assert loop.events == ["late", "late"]
+
+
+def test_a_late_call_where_the_tip_is_expected_out_of_reach(live, centre):
+    """What is expected is an estimate: it may lie where no rods can be, and a late call goes on from there linearly."""
+    loop = Loop(live, centre).run(5)
+    live.work.foresight.expected[:2] = -0.27, 0.2
+    loop.wait(30)
+    loop.call()
+    assert set(loop.events) == {"late", "measurement"}
+    # The motors keep their limits until the tip has said the same for long enough, and is believed.
+    assert loop.run(35).events[-1] in ("resumed", "reinitialised")
 
 
 def test_calls_that_do_not_go_on_repeat_the_rates(live, centre):
@@ -369,6 +381,17 @@ def test_where_nothing_is_to_be_tracked_the_motors_are_held():
     held = make_controller(load_scene(MODELS / "scenes" / "release.toml"))
     held.start((0.0, 0.25), (3.3, -0.2))
     assert (held.step(tip=(0.0, 0.25), angles=None, time=1.0).u == 0.0).all()
+
+
+def test_no_rods_are_started_anew_while_it_runs(pair, tuning, centre, monkeypatch):
+    """Where the rods have inertia too; a start from nodes takes periods."""
+    model = replace(tuning.model, inertia="condensed")
+    controller = make_controller(pair, lambda t: (0.02 * np.sin(2 * t) ** 2, 0.25), replace(tuning, model=model))
+    loop = Loop(controller, centre).run(1)
+    monkeypatch.setattr(RodSolver, "start", lambda *_: pytest.fail("the rods were started anew"))
+    loop.run(60)
+    t = loop.t + 1e-3 * (np.arange(-100, 0) + 1)
+    assert 1e3 * np.abs(np.array(loop.tips[-100:])[:, 0] - 0.02 * np.sin(2 * t) ** 2).max() < 0.1
 
 
 @pytest.mark.slow

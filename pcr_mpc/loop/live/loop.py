@@ -135,9 +135,9 @@ class LiveLoop:
         """Let the reference be for another controller, from the present on."""
         if asked == self._asked:
             return
-        old, k = self.reference, max(self.k, self.reference.first)
-        self._asked, self.reference = asked, LiveReference(asked)
-        self.reference.go_on_from(old, k)
+        reference = LiveReference(asked)
+        reference.go_on_from(self.reference, self._now())
+        self._asked, self.reference = asked, reference
 
     def _stand(self, k: int, found: StartPose, velocity: np.ndarray) -> None:
         self.reference.start(found.pose, k)

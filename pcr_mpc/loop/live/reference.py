@@ -11,7 +11,6 @@ from ...control.qp import Reference
 from ...errors import PCRError, UnreachableError, checked_vector
 from ...plant.statics.equilibrium import Equilibrium
 from ..references.trajectory import Trajectory, sampled
-from .inverse import BLOCK
 from .motions import Following, Motion, Pursuit
 from .rows import QUICKNESS, Rows
 
@@ -43,7 +42,7 @@ class LiveReference(Rows):
         """Stand in a pose in period k, which may be under load: the motors are then where no load would have them."""
         self.first, self._motion = k, self._still(pose.p, k)
         self._point = None
-        row = self._inverse.at(pose)
+        row = self._at(pose)
         state = np.zeros((1, 3, 2))
         state[0, 0] = pose.p
         force = self._force(state, k, row)
@@ -59,7 +58,7 @@ class LiveReference(Rows):
         """Go on from period k of a reference that was solved from ``pose`` on, along its path."""
         at = min(k, len(known.states) - 1)
         way = np.unique([*range(0, at, _STRIDE), at])
-        rows, error = self._inverse.rows(self._inverse.at(pose), known.states[way, :2], known.forces[way])
+        rows, error = self._inverse.rows(self._at(pose), known.states[way, :2], known.forces[way])
         if error is not None:
             raise error
         last = rows[-1]
@@ -78,7 +77,7 @@ class LiveReference(Rows):
         """Go on from period k of another one."""
         i = k - other.first
         self.first, self._motion, self._point = k, other._motion, other._point
-        self._rows = other._rows[i : i + 1]
+        self._rows = [self._at(other.pose(k))]
         self._samples, self._states, self._forces = (
             each[i : i + 1] for each in (other._samples, other._states, other._forces)
         )
@@ -100,8 +99,7 @@ class LiveReference(Rows):
             )
         self.first = k
         missing = self._ahead(self._motion) - len(self._rows)
-        # A block of rows at once costs less than one after the other.
-        error = self._extend(missing + BLOCK - 1) if missing > 0 else None
+        error = self._extend(missing + self.block - 1) if missing > 0 else None
         if error is None:
             return []
         left = len(self._rows)

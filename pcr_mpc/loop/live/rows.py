@@ -13,7 +13,7 @@ from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
 from ..scene.settings import Payload
-from .inverse import OnlineInverse, Row
+from .inverse import BLOCK, OnlineInverse, Row
 from .motions import Motion, Pursuit
 
 _LOOK_AHEAD = 0.25  # s, beyond the controller's horizon: there is time to brake before what cannot be had
@@ -77,6 +77,7 @@ class Rows:
         self._inverse = OnlineInverse(robot, compiled=asked.compiled)
         self._inverse.prepare()
         self._mass = Plant(robot, inertia=asked.inertia) if asked.inertia != "none" else None
+        self._inertia_at: tuple[Row, np.ndarray, np.ndarray] | None = None
         self.first = 0  # period of the first row
         self._rows: list[Row] = []
         self._samples = np.empty((0, 3, 2))
@@ -98,6 +99,11 @@ class Rows:
         return np.hstack([states[1:], rates, self._forces[i + 1 : i + 1 + horizon]])
 
     @property
+    def block(self) -> int:
+        """Rows that are made at once as that costs less; where the rods' inertia is reckoned with, it does not."""
+        return 1 if self._mass is not None else BLOCK
+
+    @property
     def carries(self) -> bool:
         """Whether the tip ever carries anything."""
         return self.asked.payload is not None
@@ -109,6 +115,12 @@ class Rows:
     def pose(self, k: int) -> Equilibrium:
         """Pose of the target in period k."""
         return self._inverse.pose(self._rows[k - self.first])
+
+    def _at(self, pose: Equilibrium) -> Row:
+        """The row that is a pose, from which the others are followed."""
+        if self._mass is not None:
+            self._mass.reset(np.concatenate([pose.p, np.zeros(2), pose.q]), pose)
+        return self._inverse.at(pose)
 
     def _still(self, point: Any, k: int) -> Pursuit:
         return Pursuit(self.asked.period, tuple(point), (0.0, 0.0), k, QUICKNESS / self.asked.period, 1.0, 1.0, 1.0)
@@ -149,11 +161,12 @@ class Rows:
         else:
             rows, error, found = [], None, []
             for j in range(count):  # the rods' inertia is that of the row before
-                found.append(self._force(samples[j : j + 1], k + 1 + j, rows[-1] if rows else last))
-                more, error = self._inverse.rows(rows[-1] if rows else last, samples[j : j + 1, 0], found[-1])
-                rows += more
+                found.append(self._force(samples[j : j + 1], k + 1 + j, last))
+                more, error = self._inverse.rows(last, samples[j : j + 1, 0], found[-1])
                 if error is not None:
                     break
+                last = more[0]
+                rows.append(last)
             forces = np.vstack(found)
         done = len(rows)
         if done:
@@ -185,17 +198,19 @@ class Rows:
         carried = self.asked.carried(k, len(samples))[:, None]
         forces = carried * (np.array(robot.gravity) - a) - robot.tip_mass * a - robot.drag * v
         if self._mass is not None:
-            own, coupled, levers = self._inertia(row)
+            own, coupled = self._inertia(row)
             # The motors turn with the tip as at rest; terms of second order in the velocities are left out.
-            forces -= a @ (own + coupled @ levers).T - robot.tip_mass * a
+            forces -= a @ (own + coupled).T - robot.tip_mass * a
         return np.asarray(forces)
 
-    def _inertia(self, row: Row) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """M_pp, M_pq and dq/dp at a row."""
+    def _inertia(self, row: Row) -> tuple[np.ndarray, np.ndarray]:
+        """M_pp, and M_pq dq/dp, at a row."""
         assert self._mass is not None
-        self._mass.reset(np.concatenate([row.p, np.zeros(2), row.q]), self._inverse.pose(row))
-        mass = self._mass.mass(row.p, row.q)[0]
-        return mass[:2, :2], mass[:2, 2:], row.levers
+        if self._inertia_at is None or self._inertia_at[0] is not row:
+            self._mass.recall(row.record)
+            mass = self._mass.mass(row.p, row.q)[0]
+            self._inertia_at = row, mass[:2, :2], mass[:2, 2:] @ row.levers
+        return self._inertia_at[1:]
 
     def _velocities(self, samples: np.ndarray, rows: list[Row]) -> np.ndarray:
         """Velocities of the state: the momentum over M_pp (see `Plant`)."""
@@ -203,6 +218,6 @@ class Rows:
             return samples[:, 1]
         found = samples[:, 1].copy()
         for velocity, row in zip(found, rows, strict=True):
-            own, coupled, levers = self._inertia(row)
-            velocity += np.linalg.solve(own, coupled @ levers @ velocity)
+            own, coupled = self._inertia(row)
+            velocity += np.linalg.solve(own, coupled @ velocity)
         return found
