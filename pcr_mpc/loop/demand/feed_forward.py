@@ -13,11 +13,14 @@ from ... import interrupt
 from ...control.qp import Reference
 from ...errors import ConvergenceError, PCRError, cause
 from ...frozen import Frozen
+from ...plant.motion.mass_matrix import CondensedMass
 from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
+from ...plant.rods.method import closed_form_method
+from ...plant.statics.along import inverse_statics_along
+from ...plant.statics.equilibria import Equilibria
 from ...plant.statics.equilibrium import Equilibrium
-from ...plant.statics.free_tip import inverse_statics
-from ...plant.statics.stability import least_rod_margin
+from ...plant.statics.margins import largest_strains, least_rod_margins, least_stiffnesses
 from ..references.trajectory import sampled
 from ..scene.scene import Scene
 
@@ -106,18 +109,16 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     forces = loads - robot.tip_mass * a - robot.drag * v
     resting = carried[:, None] * np.array(robot.gravity)
     poses = poses_along(robot, pose, t, p, forces, resting, a)
-    q = np.stack([eq.q for eq in poses])
+    q = poses.q
     if inertia != "none":
-        plant = Plant(robot, inertia=inertia)
         rate_of = _differences(t)
         for _ in range(_MOST_SWEEPS):
-            plant.reset(np.concatenate([p[0], v[0], q[0]]), pose)
-            momentum, push, own, coupling = _momentum(plant, carried, p, v, q, rate_of @ q)
+            momentum, push, own, coupling = _momentum(poses, pose, inertia, carried, v, rate_of @ q)
             wanted = loads + push - rate_of @ momentum - robot.drag * v
             # The turn that makes up for what is missing moves the rods' mass, too.
             forces = wanted - _moved_by(wanted - forces, poses, coupling, rate_of)
             poses = poses_along(robot, pose, t, p, forces, resting, a)
-            before, q = q, np.stack([eq.q for eq in poses])
+            before, q = q, poses.q
             change = float(np.abs(q - before).max())
             if change < _SETTLED:
                 break
@@ -136,19 +137,19 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
 
 
 def _inverse_dynamics(
-    states: np.ndarray, rates: np.ndarray, forces: np.ndarray, poses: list[Equilibrium], inertia: str
+    states: np.ndarray, rates: np.ndarray, forces: np.ndarray, poses: Equilibria, inertia: str
 ) -> InverseDynamics:
-    levers = np.stack([np.linalg.pinv(eq.dforce_dq) for eq in poses])
+    levers = np.linalg.pinv(poses.dforce_dq)
     return InverseDynamics(
         states,
         rates,
         forces,
         angles_per_force=levers,
-        torques=np.stack([eq.motor_torque for eq in poses]),
-        torques_per_force=np.stack([eq.dtorque_dq for eq in poses])[:, :, None] * levers,
-        stiffness=np.array([eq.stiffness_eigenvalues[0] for eq in poses]),
-        rod_margin=np.array([least_rod_margin(eq) for eq in poses]),
-        strains=np.stack([eq.max_strain for eq in poses]),
+        torques=poses.motor_torque,
+        torques_per_force=poses.dtorque_dq[:, :, None] * levers,
+        stiffness=least_stiffnesses(poses),
+        rod_margin=least_rod_margins(poses),
+        strains=largest_strains(poses),
         inertia=inertia,
     )
 
@@ -173,10 +174,11 @@ def held(
     on_the_way = np.unique([*range(0, k, _STRIDE), k])
     p = reference.states[[*on_the_way, k], :2]
     forces = np.vstack([reference.forces[on_the_way], payload * np.array(robot.gravity)])
-    end = poses_along(robot, pose, np.full(len(p), np.nan), p, forces, forces, np.zeros_like(p))[-1]
-    state = np.concatenate([end.p, np.zeros(2), end.q])
+    poses = poses_along(robot, pose, np.full(len(p), np.nan), p, forces, forces, np.zeros_like(p))
+    end = poses.rows(np.full(count + 1, len(p) - 1))
+    state = np.concatenate([end.p[0], np.zeros(2), end.q[0]])
     states, forces = np.tile(state, (count + 1, 1)), np.tile(forces[-1], (count + 1, 1))
-    return _inverse_dynamics(states, np.zeros((count, robot.n_rods)), forces, [end] * (count + 1), "none")
+    return _inverse_dynamics(states, np.zeros((count, robot.n_rods)), forces, end, "none")
 
 
 def poses_along(
@@ -187,17 +189,18 @@ def poses_along(
     forces: np.ndarray,
     resting: np.ndarray,
     accelerations: np.ndarray,
-) -> list[Equilibrium]:
+) -> Equilibria:
     """Poses at which the rods carry the forces at the tips p; ``resting`` is what they would carry at rest [N]."""
-    poses, eq = [], pose
-    for k in range(len(t)):
-        interrupt.check()
-        try:
-            eq = inverse_statics(robot, p[k], forces[k], guess=eq)
-        except PCRError as error:
-            raise _explained(robot, pose, t, p, forces, resting, accelerations, k, error) from None
-        poses.append(eq)
-    return poses
+    try:
+        return inverse_statics_along(robot, p, forces, pose)
+    except PCRError as error:
+        raise _explained(robot, pose, t, p, forces, resting, accelerations, *_lost(error)) from None
+
+
+def _lost(error: PCRError) -> tuple[int, PCRError]:
+    """Place at which the rods could not carry the force, and why."""
+    row = error.details.pop("row")
+    return int(row), error
 
 
 def _explained(
@@ -234,12 +237,10 @@ def _explained(
 
 def _first_lost(robot: Robot, pose: Equilibrium, p: np.ndarray, forces: np.ndarray) -> tuple[int, PCRError] | None:
     """First place at which the rods cannot carry the force there, and why; None if they can all the way."""
-    for k in range(len(p)):
-        interrupt.check()
-        try:
-            pose = inverse_statics(robot, p[k], forces[k], guess=pose)
-        except PCRError as error:
-            return k, error
+    try:
+        inverse_statics_along(robot, p, forces, pose)
+    except PCRError as error:
+        return _lost(error)
     return None
 
 
@@ -248,14 +249,12 @@ def _differences(t: np.ndarray) -> sparse.csr_array:
     return sparse.csr_array(np.gradient(np.eye(len(t)), t, axis=0, edge_order=2))
 
 
-def _moved_by(
-    missing: np.ndarray, poses: list[Equilibrium], coupling: np.ndarray, rate_of: sparse.csr_array
-) -> np.ndarray:
+def _moved_by(missing: np.ndarray, poses: Equilibria, coupling: np.ndarray, rate_of: sparse.csr_array) -> np.ndarray:
     """What the rods' mass takes, (K, 2) [N], where the motors turn to make up for forces that are missing.
 
     With turns dq = G^+ f by forces f that the rods carry, f + d/dt(M_pq d/dt dq) is missing.
     """
-    levers = np.stack([np.linalg.pinv(eq.dforce_dq) for eq in poses])
+    levers = np.linalg.pinv(poses.dforce_dq)
     twice = sparse.csr_array(sparse.kron(rate_of, np.eye(2)))
     turned = sparse.block_diag(list(coupling)) @ sparse.kron(rate_of, np.eye(coupling.shape[2]))
     taken = twice @ turned @ sparse.block_diag(list(levers))
@@ -264,18 +263,32 @@ def _moved_by(
 
 
 def _momentum(
-    plant: Plant, carried: np.ndarray, p: np.ndarray, v: np.ndarray, q: np.ndarray, rates: np.ndarray
+    poses: Equilibria, pose: Equilibrium, inertia: str, carried: np.ndarray, v: np.ndarray, rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Momentum of tip and rods [N s], dT/dp [N], M_pp^-1 pi with what is carried [m/s] at K poses, (K, 2) each; M_pq,
     (K, 2, n)."""
-    n = 2 + plant.robot.n_rods
-    momentum, push, own = (np.empty_like(p) for _ in range(3))
-    coupling = np.empty((len(p), 2, n - 2))
-    for k in range(len(p)):
-        interrupt.check()
-        mass, slopes = plant.mass(p[k], q[k])
-        w = np.concatenate([v[k], rates[k]])
-        momentum[k], coupling[k] = mass[:2] @ w, mass[:2, 2:]
-        push[k] = [w @ slopes[:, axis].reshape(n, n, order="F") @ w / 2 for axis in (0, 1)]
-        own[k] = np.linalg.solve(mass[:2, :2] + carried[k] * np.eye(2), momentum[k] + carried[k] * v[k])
+    mass, slopes = _masses(poses, pose, inertia)
+    w, size = np.concatenate([v, rates], axis=1), mass.shape[1]
+    momentum, coupling = np.einsum("kij,kj->ki", mass[:, :2], w), mass[:, :2, 2:]
+    by_tip = slopes[:, :, :2].reshape(-1, size, size, 2)  # M is symmetric: rows and columns are one
+    push = np.einsum("ki,kijp,kj->kp", w, by_tip, w) / 2
+    loaded = mass[:, :2, :2] + carried[:, None, None] * np.eye(2)
+    own = np.linalg.solve(loaded, (momentum + carried[:, None] * v)[:, :, None])[:, :, 0]
     return momentum, push, own, coupling
+
+
+def _masses(poses: Equilibria, pose: Equilibrium, inertia: str) -> tuple[np.ndarray, np.ndarray]:
+    """Mass matrices of tip and rods at each pose and their slopes, as `Plant.mass` has them."""
+    found = []
+    if inertia == "condensed" and poses.method == "closed_form":
+        condensed = CondensedMass(poses.robot, closed_form_method())
+        for unknowns, q in zip(poses.unknowns, poses.q, strict=True):
+            interrupt.check()
+            found.append(condensed(unknowns.T, q))
+    else:
+        plant = Plant(poses.robot, inertia=inertia)
+        plant.reset(np.concatenate([poses.p[0], np.zeros(2), poses.q[0]]), pose)
+        for p, q in zip(poses.p, poses.q, strict=True):
+            interrupt.check()
+            found.append(plant.mass(p, q))
+    return np.stack([mass for mass, _ in found]), np.stack([slopes for _, slopes in found])

@@ -92,11 +92,10 @@ class Slowed:
         resting = carried * np.array(robot.gravity)
         forces = resting + inertial / slower**2 + drag / slower
         poses = poses_along(robot, pose, slower * own, p, forces, resting, a / slower**2)
-        levers = np.stack([np.linalg.pinv(eq.dforce_dq) for eq in poses])
+        levers = np.linalg.pinv(poses.dforce_dq)
         return Slowed(
-            scene, drag, inertial, slower, np.stack([eq.q for eq in poses]),
-            np.stack([eq.motor_torque for eq in poses]), levers,
-            np.stack([eq.dtorque_dq for eq in poses])[:, :, None] * levers,
+            scene, drag, inertial, slower, poses.q, poses.motor_torque, levers,
+            poses.dtorque_dq[:, :, None] * levers,
         )  # fmt: skip
 
     def factor(self, kind: int, limit: float) -> float:

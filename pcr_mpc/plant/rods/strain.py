@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from scipy.special import ellipkm1
@@ -21,23 +22,21 @@ def quarter_period(log_tip_angle: float) -> float:
     return math.log(8.0) - log_tip_angle if log_tip_angle < _LOG_TAUT else float(ellipkm1(math.sin(half) ** 2))
 
 
-def largest_moment(theta: float, n_x: float, n_y: float, m: float) -> float:
-    """Largest |m| along a plain rod, exact, from its state at the base, normalised.
+def largest_moment(theta: Any, n_x: Any, n_y: Any, m: Any) -> Any:
+    """Largest |m| along plain rods, exact, from their states at the base, normalised; numbers or arrays.
 
     The rod is the pendulum m'' = (n . t) m of energy H = m^2 / 2 + n . t. Where it swings through the lowest point,
     n . t = -lambda^2, the moment there is 2 lambda k with k^2 = (H / lambda^2 + 1) / 2; else it is largest at the base.
     """
-    pull, square = n_x * math.cos(theta) + n_y * math.sin(theta), math.hypot(n_x, n_y)
-    if square == 0.0:
-        return abs(m)
-    k_square = min(max((m * m / 2 + pull + square) / (2 * square), 0.0), 1.0)
+    cos, sin, square = np.cos(theta), np.sin(theta), np.hypot(n_x, n_y)
+    # Without a force the moment is the same all along, whatever is divided by.
+    known = np.where(square > 0.0, square, 1.0)
+    k_square = np.clip((m * m / 2 + n_x * cos + n_y * sin + square) / (2 * known), 0.0, 1.0)
     # Taut rods tell by the side to which the moment grows at the base: there, none has passed the point twice.
-    inside = (
-        math.sqrt(square) > ellipkm1(1.0 - k_square)
-        if 1.0 - k_square > _TAUT
-        else m * (n_x * math.sin(theta) - n_y * math.cos(theta)) > 0
-    )
-    return 2.0 * math.sqrt(square * k_square) if inside else abs(m)
+    taut = 1.0 - k_square <= _TAUT
+    swings = np.sqrt(square) > ellipkm1(np.where(taut, 1.0, 1.0 - k_square))
+    inside = (square > 0.0) & np.where(taut, m * (n_x * sin - n_y * cos) > 0, swings)
+    return np.where(inside, 2.0 * np.sqrt(square * k_square), np.abs(m))
 
 
 def strain_along(rod: Rod, nodes: np.ndarray, physics: RodPhysics | None, n_points: int) -> np.ndarray:

@@ -355,16 +355,24 @@ def _many_graph(kind: Kind, method: RodMethod, count: int, along: bool, compiled
     """(record or starts, targets, numbers) -> records, verdicts, results of ``count`` poses."""
     warm = _one_graph(kind, method, compiled)
     target, start, numbers = (ca.MX.sym(warm.name_in(i), *warm.size_in(i)) for i in range(3))
-    found = warm(target, start, numbers)
     if not along:
+        found = warm(target, start, numbers)
         return ca.Function("pose", [start, target, numbers], found).map("poses", "serial", count, [2], [])
-    # The whole record goes on from pose to pose, though only its first part is started from: it is there once.
-    record = ca.MX.sym("record", found[0].numel())
-    found = warm(target, record[: start.numel()], numbers)
-    step = ca.Function("pose", [record, target, numbers], found)
-    if warm.is_a("SXFunction"):
-        step = step.expand()
-    many = step.mapaccum("poses", count, 1, {})
+    step = _one_step(kind, method, compiled)
     targets = ca.MX.sym("targets", target.numel(), count)
-    moved: Any = many(record, targets, ca.repmat(numbers, 1, count))
+    record = ca.MX.sym("record", step.numel_in(0))
+    moved: Any = step.mapaccum("poses", count, 1, {})(record, targets, ca.repmat(numbers, 1, count))
     return ca.Function("path", [record, targets, numbers], list(moved))
+
+
+@graph_cache(maxsize=8)
+def _one_step(kind: Kind, method: RodMethod, compiled: bool) -> Any:
+    """From a record to the next, for a path of any length.
+
+    The whole record goes on from pose to pose, though only its first part is started from: it is there once.
+    """
+    warm = _one_graph(kind, method, compiled)
+    target, start, numbers = (ca.MX.sym(warm.name_in(i), *warm.size_in(i)) for i in range(3))
+    record = ca.MX.sym("record", warm.numel_out(0))
+    step = ca.Function("pose", [record, target, numbers], warm(target, record[: start.numel()], numbers))
+    return step.expand() if warm.is_a("SXFunction") else step

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,13 @@ import numpy as np
 from ...frozen import Frozen
 from ..robot import Robot
 from ..rods.method import TO_NODES, enough_nodes
+from .equilibrium import Equilibrium
+from .state import columns
+
+_COMMON = (
+    "p", "q", "force", "dforce_dp", "dforce_dq", "motor_torque", "dtorque_dq", "energy", "rod_forces", "residual_norm",
+    "drift",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,3 +108,19 @@ class Equilibria(Frozen):
         loads = self.rod_forces[row].T / (self.robot.stiffnesses / self.robot.lengths**2)
         count, to_nodes = enough_nodes(loads, 8), TO_NODES[self.method]
         return np.stack([to_nodes(u, q, count) for u, q in zip(self.unknowns[row], self.q[row], strict=True)])
+
+
+def together(poses: Sequence[Equilibrium]) -> Equilibria:
+    """Poses of one robot that were solved one by one by the same method; each has its record."""
+    robot = poses[0].robot
+    arrays = {name: np.stack([getattr(eq, name) for eq in poses]) for name in _COMMON}
+    records = np.stack([eq.record for eq in poses if eq.record is not None])
+    return Equilibria(
+        robot,
+        method=poses[0].method,
+        unstable=np.array([[rod in eq.unstable_rods for rod in range(robot.n_rods)] for eq in poses]),
+        reason=("",) * len(poses),
+        unknowns=np.stack([columns(record, robot.n_rods).unknowns.T for record in records]),
+        records=records,
+        **arrays,
+    )

@@ -188,7 +188,7 @@ class Equilibrium(Frozen):
                 unit = rod.bending_stiffness / rod.length**2
                 n_x, n_y = (self.rod_forces[i] / unit).tolist()
                 m = float(self.motor_torque[i]) / (unit * rod.length)
-                found[i] = rod.thickness_ratio * largest_moment(float(self.q[i]), n_x, n_y, -m)
+                found[i] = rod.thickness_ratio * float(largest_moment(float(self.q[i]), n_x, n_y, -m))
             else:
                 found[i] = largest_strain(rod, self.nodes[i], physics)[1]
         return read_only(found)

@@ -24,7 +24,7 @@ from .free_tip import free_solver
 from .solver import RodSolver
 
 _MAX_ITERATIONS = 40
-_NEAR = 0.3  # margin of a rod below which it is computed exactly
+NEAR = 0.3  # margin of a rod below which it is computed exactly
 _BALANCED = 1e-9  # residual force, of sum EI/L^2
 _SAME = 1e-4  # of the rods' length, and of EI/L^2 and their forces, within which two poses are one
 _RESOLVED = 1e-5  # residual and drift at which the sweep is trusted
@@ -97,7 +97,7 @@ def rod_margins(eq: Equilibrium) -> list[float]:
     for i, (force, rod) in enumerate(zip(eq.rod_forces.tolist(), eq.robot.rods, strict=True)):
         load = rod.length * math.sqrt(math.hypot(*force) / rod.bending_stiffness)
         bound = 1.0 - load / LEAST_CRITICAL_LOAD
-        if bound < _NEAR:
+        if bound < NEAR:
             log_tip_angle, load, _ = elastica.from_nodes(eq.nodes[i])
             bound = 1.0 - load / critical_load(log_tip_angle)
         margins.append(bound)

@@ -11,9 +11,9 @@ import numpy as np
 from ...errors import check_numbers
 from ...linearisation.pose_limits import PoseLimits
 from ...loop.scene.scene import Scene
-from ...plant.rods.chart import LEAST_CRITICAL_LOAD, critical_load
 from ...plant.statics.equilibria import Equilibria
 from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.margins import loads
 from .angles import followed
 from .linear import Linear
 
@@ -201,16 +201,6 @@ def _rod_margin(least: float, asked: Asked) -> Use:
         # Rods do not couple at a held tip: all motors at once.
         slope = (loads(_turned(asked, slice(None)), _WATCHED * most) - here) / _ANGLE
     return Use("rod margin", (1.0 / most) * Linear(here, slope[:, :, None] * asked.q.slope), both=False)
-
-
-def loads(poses: Equilibria, exact_from: float) -> np.ndarray:
-    """Lambda over lambda_c of plain rods in closed form, shape (R, n); too much where it is less than given."""
-    robot = poses.robot
-    load = robot.lengths * np.sqrt(np.linalg.norm(poses.rod_forces, axis=2) / robot.stiffnesses)
-    critical = np.full(load.shape, LEAST_CRITICAL_LOAD)
-    for row, rod in np.argwhere(load > exact_from * LEAST_CRITICAL_LOAD):
-        critical[row, rod] = critical_load(float(poses.unknowns[row, rod, 0]))
-    return np.asarray(load / critical)
 
 
 def _turned(asked: Asked, motors: int | slice) -> Equilibria:
