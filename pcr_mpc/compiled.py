@@ -22,6 +22,7 @@ from typing import Any
 
 import casadi as ca
 
+from . import interrupt
 from .buffered import dense, graph_cache
 from .errors import CompilerError
 
@@ -105,7 +106,7 @@ def _built(name: str, source: str, flags: tuple[str, ...], folder: Path) -> Path
     path.write_text(source)
     print(f"building machine code of {name!r} ({len(source) // 1000} kB of C), once", file=sys.stderr)
     command = [*_compiler(), *flags, str(path), "-o", str(library), "-lm"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, errors="replace")
+    done = interrupt.completed(command)
     if done.returncode or not library.is_file():
         raise _failure(name, done.stderr.strip() or f"it ended with status {done.returncode} and said nothing")
     library.chmod(0o700)  # whatever the umask

@@ -15,8 +15,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
+_ENDING = 0.5  # s
 _LISTEN = 0.1  # s, between looks at whether to stop
 _noted: int | None = None
+_programs: list[subprocess.Popen[str]] = []
 _nothing_to_lose = False
 
 
@@ -27,7 +29,7 @@ def check() -> None:
 
 
 def completed(command: list[str]) -> subprocess.CompletedProcess[str]:
-    """Run another program, and end it and raise `KeyboardInterrupt` if a signal to stop is noted meanwhile.
+    """Run another program; it ends with this process, and where a signal to stop is noted meanwhile.
 
     Raises
     ------
@@ -35,8 +37,12 @@ def completed(command: list[str]) -> subprocess.CompletedProcess[str]:
         There is no such program.
     """
     # In a session of its own: Ctrl-C in a terminal is ours alone, and what the program has started ends with it.
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace",
-                          start_new_session=True) as process:  # fmt: skip
+    with (
+        _ending_programs(),
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace",
+                         start_new_session=True) as process,
+    ):  # fmt: skip
+        _programs.append(process)
         try:
             while True:
                 with suppress(subprocess.TimeoutExpired):
@@ -44,11 +50,46 @@ def completed(command: list[str]) -> subprocess.CompletedProcess[str]:
                     return subprocess.CompletedProcess(command, process.returncode, out, err)
                 check()
         except BaseException:
-            if hasattr(os, "killpg"):
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-            process.kill()
+            _end(process)
             raise
+        finally:
+            _programs.remove(process)
+
+
+def end_programs() -> None:
+    """End all programs that `completed` waits for, before a process that ends at once."""
+    for process in list(_programs):
+        _end(process)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """By force if need be; a compiler takes its files away before."""
+    for kind in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
+        with suppress(OSError):
+            os.killpg(process.pid, kind) if hasattr(os, "killpg") else process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_ENDING)
+
+
+@contextmanager
+def _ending_programs() -> Iterator[None]:
+    """Where SIGTERM would end this process at once, as it does a worker, let it end its programs before."""
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    ):
+        yield
+        return
+
+    def end(kind: int, frame: FrameType | None) -> None:
+        end_programs()
+        os._exit(128 + kind)
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def exit_status() -> int:
@@ -132,5 +173,6 @@ def _note(kind: int, frame: FrameType | None) -> None:
         _noted = kind
         return
     # Not by sys.exit: that would wait for whatever does not end.
+    end_programs()
     os.write(2, b"pcr-mpc: interrupted\n")
     os._exit(128 + kind)

@@ -20,6 +20,11 @@ from ..plant.rods.method import warm_calls
 # Kept to one translation unit, where what nobody calls falls away.
 _HEAD = """/* Written by CasADi from the graphs of pcr_mpc; the functions at the end are what pcr_graphs.h declares. */
 #define CASADI_SYMBOL_EXPORT static
+#ifdef __GNUC__
+/* All functions have the same parameters, and companions that only a loader of libraries asks. */
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#pragma GCC diagnostic ignored "-Wunused-function"
+#endif
 """
 
 

@@ -24,6 +24,7 @@ _SINGLE = {
     "PCR_NARROW": 1e-6,
     "PCR_DIFFERENCE": 1e-2,
 }
+_SMALLEST = 1.17549435e-38  # normal float
 _TOKENS = re.compile(
     r"""(?P<kept>/\*.*?\*/|"(?:\\.|[^"\\\n])*"|//[^\n]*)|(?P<type>\bdouble\b)
     |\b(?P<function>a?(?:sin|cos|tan)h?|atan2|exp|expm1|log|log1p|sqrt|pow|hypot|f(?:abs|max|min|mod)|copysign|ceil|floor|rint)
@@ -44,6 +45,8 @@ def in_single(text: str) -> str:
     def other(found: re.Match[str]) -> str:
         if found["kept"]:
             return found["kept"]
+        if found["number"] and 0.0 < float(found["number"]) < _SMALLEST:
+            return f"{_SMALLEST}f"  # what keeps a divisor from zero must not become zero
         return "float" if found["type"] else f"{found['function'] or found['number']}f"
 
     return _TOKENS.sub(other, text)

@@ -7,6 +7,7 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
@@ -23,6 +24,7 @@ from .happened import replayed
 from .real_time import preferred, run_plant
 
 _T = TypeVar("_T")
+_ENDING = 2.0  # s
 _PATIENCE = 120.0  # s, until the controller's process has ended
 _SILENCE, _SILENCE_TIME = 5, 0.25  # periods at least, and s
 
@@ -152,11 +154,11 @@ def run_hil(scene: Scene, *, generated: bool = False, progress: bool = False) ->
         delay = float(late.mean()) if len(late) else 0.0
         simulated = _tried(lambda: _simulated(scene, delay), math.nan)
         states = _tried(lambda: _expected(ours, process, math.inf), np.full_like(log.states, np.nan))
+        process.join(_ENDING)
     finally:
-        if process.is_alive():
-            process.join(2.0)
-        if process.is_alive():
-            process.terminate()
+        process.terminate()  # and the compiler that it may wait for
+        process.join(_ENDING)
+        process.kill()
     t = scene.plant.dt * np.arange(len(log.states))
     assert scene.trajectory is not None
     wanted = scene.trajectory(t)[:, 0]
@@ -191,11 +193,16 @@ def _expected(pipe: Connection, process: Any, patience: float) -> Any:
 
 
 def _controller(scene: Scene, generated: bool, pipe: Connection) -> None:
-    """The other process."""
+    """The other process; told to end, it takes away what it has made."""
+    with interrupt.listening(), suppress(KeyboardInterrupt):
+        follow_the_parent()
+        _serve(scene, generated, pipe)
+
+
+def _serve(scene: Scene, generated: bool, pipe: Connection) -> None:
     from .decider import make_decider
     from .server import Server
 
-    follow_the_parent()
     # A process that is kept waiting by others, a tenth of a second now and then, has not fallen silent.
     silence = max(_SILENCE, math.ceil(_SILENCE_TIME / scene.period))
     try:

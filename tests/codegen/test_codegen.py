@@ -274,9 +274,9 @@ def test_steps_in_c_are_timed_one_by_one(monkeypatch):
     found = time_in_c(scene, "osqp", 35)
     assert (found["control"].shape, found["plant"].shape) == ((40, 2), (400, 2))  # whole runs
     assert (found["plant"] > 0).all()
-    worst, longest = found["worst"], found["control"][:, 0].reshape(2, -1).min(axis=0).max()
+    worst = found["worst"]
     assert worst["iterations"] == scene.tuning.max_iterations
-    assert worst["us"] > 2e6 * longest  # 500 iterations where 15 do
+    assert worst["us"] == pytest.approx(worst["rest_us"] + worst["iterations"] * worst["iteration_us"])
 
 
 @needs_compiler
@@ -305,11 +305,10 @@ def test_the_program_of_the_readme_compiles_as_it_says(lemniscate, tmp_path):
 def test_no_compiler_warns_of_the_runtime(compiler, each):
     if not shutil.which(compiler):
         pytest.skip(f"there is no {compiler} here")
-    own = sorted(path.name for path in (ROOT / "pcr_mpc" / "codegen" / "c").glob("*.c"))
-    assert len(own) > 8
+    own = sorted(path.name for path in each.glob("*.c"))
+    assert {"main.c", "pcr_controller.c", "pcr_graphs.c", "pcr_tables.c", "pcr_qp.c"} < set(own)
     words = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-fsyntax-only", "-I.", *INCLUDED]
-    done = subprocess.run([compiler, *words, *own, "pcr_qp.c", "pcr_tables.c"], cwd=each, capture_output=True,
-                          text=True)  # fmt: skip
+    done = subprocess.run([compiler, *words, *own], cwd=each, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 

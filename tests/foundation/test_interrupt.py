@@ -13,11 +13,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from pcr_mpc import HoldMotors, SimulationError, interrupt, load_scene, simulate
 from pcr_mpc.cli import main
+from pcr_mpc.compiled import compiled
 from pcr_mpc.study.choice.choice import choose
 from pcr_mpc.study.episodes.parallel import as_finished, local_workers
 from tests.conftest import CONTROLLERS, MODELS, ROOT
@@ -104,6 +106,39 @@ def test_another_program_ends_with_what_it_has_started():
         interrupt.completed(["sh", "-c", "sleep 60; true"])
     assert time.monotonic() - began < 30.0
     assert interrupt.completed(["sh", "-c", "echo said; exit 3"]).stdout == "said\n"
+
+
+@linux
+def test_a_worker_that_is_told_to_end_ends_the_compiler_that_it_waits_for(tmp_path):
+    """It leaves Ctrl-C to its parent, which tells it by SIGTERM; the compiler is in a session of its own."""
+    noted = tmp_path / "pid"
+    script = (
+        "import signal; from pcr_mpc import interrupt; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        f"interrupt.completed(['sh', '-c', 'echo $$ > {noted}; sleep 60; true'])"
+    )
+    worker = subprocess.Popen([sys.executable, "-c", script])
+    wait_until(lambda: noted.exists() and noted.read_text().endswith("\n"))
+    compiler = Path(f"/proc/{noted.read_text().strip()}")
+    assert compiler.exists()
+    worker.send_signal(signal.SIGINT)
+    worker.terminate()
+    assert worker.wait(30.0) == 143
+    wait_until(lambda: not compiler.exists())
+
+
+@linux
+def test_ctrl_c_while_machine_code_is_built_ends_the_compiler(tmp_path, monkeypatch):
+    compiler = tmp_path / "cc"
+    compiler.write_text("#!/bin/sh\n[ $1 = --version ] || sleep 60; true\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", str(compiler))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    began, x = time.monotonic(), ca.SX.sym("x")
+    with interrupt.listening(), pytest.raises(KeyboardInterrupt):
+        compiled(ca.Function("slow", [x], [x**2]))
+    assert time.monotonic() - began < 30.0
+    assert not list((tmp_path / "cache" / "pcr_mpc").iterdir())
 
 
 @pytest.mark.parametrize(("kind", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])

@@ -333,7 +333,7 @@ pcr_result pcr_controller_step(pcr_controller *c, const pcr_measurement *measure
 
     /* The state at the next measurement. */
     const int fallen = output->rung != PCR_SOLVED;
-    if (!failed && PCR_DELAY) {
+    if (!failed && PCR_DELAY > 0) {
         memcpy(c->predicts, out + PCR_OUT_NOW, sizeof c->predicts);
         memcpy(foreseen, out + PCR_OUT_ARRIVING, sizeof foreseen);
     } else {
@@ -341,7 +341,7 @@ pcr_result pcr_controller_step(pcr_controller *c, const pcr_measurement *measure
             /* A plan of commanded angles has models and states of these. */
             memcpy(c->predicts, out + (PCR_COMMANDED ? PCR_OUT_FIRST : PCR_OUT_MODELS), sizeof c->predicts);
         }
-        if (as_planned && !PCR_DELAY && !PCR_COMMANDED && c->has_states && !fallen) {
+        if (as_planned && PCR_DELAY == 0 && !PCR_COMMANDED && c->has_states && !fallen) {
             memcpy(foreseen, c->states[1], sizeof foreseen);
         } else {
             predict(c->predicts, corrected, c->turning, foreseen);

@@ -198,7 +198,7 @@ pcr_result pcr_believe(pcr_controller *controller, const pcr_measurement *measur
             expected[PCR_STATES] = expected[PCR_STATES + 1] = 0.0; /* no force is suspected */
         }
         pcr_past_clear(controller);
-    } else if (PCR_PAST && tip) {
+    } else if (PCR_PAST > 0 && tip) {
         const double *gain = controller->parameters.observer_gain, away[2] = {told[0] - due[0], told[1] - due[1]};
         double change[6];
         for (int i = 0; i < 6; i++) {

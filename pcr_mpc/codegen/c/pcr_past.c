@@ -57,8 +57,8 @@ void pcr_past_remember(pcr_controller *c, const double *corrected, const double 
     const double *by_force = model + PCR_STATES * (PCR_STATES + 1 + PCR_N);
     const size_t most = PCR_PAST > 0 ? PCR_PAST - 1 : 0;
     if (c->past_count == PCR_PAST) {
-        memmove(c->past[0], c->past[1], most * sizeof c->past[0]);
-        memmove(c->past_moves[0], c->past_moves[1], most * sizeof c->past_moves[0]);
+        memmove(c->past[0], c->past + 1, most * sizeof c->past[0]);
+        memmove(c->past_moves[0], c->past_moves + 1, most * sizeof c->past_moves[0]);
         c->past_count--;
     }
     double *at = c->past[c->past_count];

@@ -149,6 +149,7 @@ def _end_with_the_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    interrupt.end_programs()
     os._exit(1)
 
 
