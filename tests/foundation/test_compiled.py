@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import CompilerError, PCRError, Plant
-from pcr_mpc.buffered import BufferedFunction
+from pcr_mpc.buffered import BufferedFunction, listed
 from pcr_mpc.compiled import compiled, fastest, has_compiler
 from pcr_mpc.plant.rods.elastica import rod_newton
 
@@ -336,6 +336,19 @@ def test_machine_code_is_dense_whatever_the_graph_is(folder):
     buffered.inputs[0][:] = 1.0, 2.0, 3.0
     buffered()
     np.testing.assert_array_equal(buffered.outputs[0], np.diag([1.0, 2.0, 3.0]))
+
+
+def test_a_list_of_instructions_gives_the_same_bits_as_calls():
+    """CasADi makes x of x / y * y where it sees both operations."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    divided = ca.Function("divided", [x, y], [x / y])
+    i, j = ca.MX.sym("i"), ca.MX.sym("j")
+    calls = ca.Function("calls", [i, j], [divided(i, j) * j], ["x", "y"], ["product"])
+    instructions = listed(calls)
+    assert instructions.is_a("SXFunction")
+    assert instructions.name_in() == ["x", "y"]
+    assert float(instructions(1.0, 49.0)) == float(calls(1.0, 49.0)) == 1.0 / 49.0 * 49.0 != 1.0
+    assert ca.GlobalOptions.getSimplificationOnTheFly()
 
 
 def test_nothing_is_compiled_by_default(pair):

@@ -16,12 +16,13 @@ from typing import Any
 
 import casadi as ca
 
-from ...buffered import graph_cache
+from ...buffered import dense, graph_cache, listed
 from ...control.observer import correction
 from ...linearisation.linearise import STIFFEST
 from ...linearisation.model_graph import force_graph, model_graph, model_list, sizes
 from ...plant.motion.step_graph import LARGEST_DRIFT, StepModel
 from ...plant.rods.follower import BRANCH_CHANGE
+from ...plant.rods.method import is_short
 
 # What a verdict of `model_graph` may be: the pose is solved far better than a controller can tell, K and G to 1e-4.
 _SOLVED, _DERIVATIVES = 1e-8, 1e-4
@@ -79,7 +80,8 @@ def foresight_graph(
         Angles that are planned from may differ from the measured ones; else ``pull`` is 1, and the graph leaves out
         what comes to nothing then.
     inline : bool
-        Make one list of instructions of each model, for CasADi's interpreter; else calls, for a compiler.
+        Make one list of instructions of it, or at least of each model, for CasADi's interpreter; else calls, for a
+        compiler.
     rounding : float
         Residual below which the numbers that it will be computed in cannot come.
 
@@ -173,7 +175,10 @@ def foresight_graph(
         "now": models[:, : places.delay], "models": of_plan, "ahead": ahead, "P": qp[0], "q": qp[1], "l": qp[2],
         "u": qp[3], "free": qp[4],
     }  # fmt: skip
-    return ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
+    graph = ca.Function("foresight", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
+    rods_are_lists = all(is_short(one.method.newton) for one in (model, target))
+    short = inline and rods_are_lists and (condense is None or condense.is_a("SXFunction"))
+    return listed(dense(graph)) if short else graph
 
 
 def _corrected(given: Any, n: int, *, commanded: bool) -> Any:

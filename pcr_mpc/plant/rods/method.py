@@ -255,5 +255,9 @@ def enough_nodes(loads: np.ndarray, least: int) -> int:
 
 def inlined(function: Any, of_rod: Any) -> Any:
     """Inline the graph of a rod into that of a robot that calls it, if it is small."""
-    small = of_rod.is_a("SXFunction") and of_rod.n_instructions() <= _INLINED_INSTRUCTIONS
-    return function.expand(function.name(), {"cse": True}) if small else function
+    return function.expand(function.name(), {"cse": True}) if is_short(of_rod) else function
+
+
+def is_short(of_rod: Any) -> bool:
+    """Whether the graph of a rod is small enough to be inlined into others."""
+    return bool(of_rod.is_a("SXFunction")) and bool(of_rod.n_instructions() <= _INLINED_INSTRUCTIONS)
