@@ -10,7 +10,8 @@ import numpy as np
 from ..errors import PCRError
 from ..loop.demand.feasibility import reference_demand, reference_excess, reference_of
 from ..loop.demand.feed_forward import InverseDynamics
-from ..loop.references.trajectory import sampled
+from ..loop.references.blended import Blended
+from ..loop.references.trajectory import Trajectory, sampled
 from ..loop.scene.scene import Scene
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.held_tip import solve_statics
@@ -41,10 +42,11 @@ def demands(scene: Scene, pose: Equilibrium) -> tuple[np.ndarray | None, dict[st
         # Of a sine, the rate of the one over the other is its angular frequency.
         "frequency_Hz": _ratio(acceleration, speed) / (2 * math.pi),
     }
+    later = _later(scene.trajectory)
     try:
         reference = reference_of(scene, pose)
     except PCRError as error:
-        return p, figures, [Remark("error", "reference", str(error))]
+        return p, figures, [Remark("error", "reference", str(error)), *later]
     excess = [Remark("error", "reference", line) for line in reference_excess(scene, reference, pose)]
     peaks = _peaks(scene, reference)
     figures["peaks"] = peaks
@@ -59,7 +61,23 @@ def demands(scene: Scene, pose: Equilibrium) -> tuple[np.ndarray | None, dict[st
         if NEAR < row["used"] <= 1.0 + 1e-6
     ]
     figures["stiffness_N_m"] = _stiffness(scene, reference, pose)
-    return p, figures, excess + near
+    return p, figures, excess + near + later
+
+
+def _later(trajectory: Trajectory) -> list[Remark]:
+    """That a path which moves from its first moment on is not where its own times say."""
+    if not isinstance(trajectory, Blended) or not trajectory.later:
+        return []
+    start, *_ = trajectory.full_speed
+    return [
+        Remark(
+            "note",
+            "reference",
+            f"the path moves at its start, so it begins in a blend of {start:.3g} s: the tip comes "
+            f"{trajectory.later:.3g} s later than the path's own times say; let it begin at rest, or give `start` of "
+            "[reference]",
+        )
+    ]
 
 
 def _peaks(scene: Scene, reference: InverseDynamics) -> dict[str, dict[str, Any]]:

@@ -51,6 +51,30 @@ def test_velocities_and_accelerations_are_taken(tmp_path):
     assert path(np.array([1.0]))[0] == pytest.approx(np.array([[0.1, 0.25], [0.3, 0.0], [0.0, -1.0]]))
 
 
+def columns(header, rows):
+    return "\n".join([",".join(header), *(",".join(f"{value:.9f}" for value in row) for row in rows)]) + "\n"
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("count", [61, 400])
+def test_rows_that_begin_and_end_at_rest_come_when_they_say(tmp_path, count, velocities):
+    """Whatever spline goes through them: no blend makes them later."""
+    u = np.linspace(0.0, 1.0, count)
+    turned, rate = u**4 * (35 - 84 * u + 70 * u**2 - 20 * u**3), 140 * u**3 * (1 - u) ** 3 / 3.0
+    angle, rate = 2 * np.pi * turned, 2 * np.pi * rate
+    p = np.column_stack([0.03 * np.sin(angle), 0.25 - 0.03 * np.cos(angle)])
+    v = 0.03 * rate[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    rows = np.column_stack([3.0 * u, p, v] if velocities else [3.0 * u, p])
+    header = ("t_s", "x_m", "y_m", "vx_m_s", "vy_m_s")[: rows.shape[1]]
+    path = Blended(load_path(written(tmp_path, columns(header, rows))))
+    assert (path.duration, path.later) == (pytest.approx(3.0), 0.0)
+    assert np.abs(path(3.0 * u)[:, 0] - p).max() < 1e-8  # as they are rounded
+    # One that moves at once is begun in a blend, which is said.
+    moving = Blended(load_path(written(tmp_path, columns(header[:3], rows[count // 4 :, :3]))))
+    assert moving.later == pytest.approx(moving.full_speed[0] / 2)
+    assert moving.later > 0.2
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

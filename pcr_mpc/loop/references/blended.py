@@ -15,7 +15,9 @@ from .trajectory import Trajectory, risen, sampled
 _SHARE, _LONGEST = 0.25, 1.0
 FOR_EVER = "for ever"
 _SAMPLES = 129
-_AT_REST = 1e-9  # of the largest speed or acceleration
+# What is slower, and slows down less, than these shares of the largest speed and acceleration is at rest: rows of a
+# file, and a spline through them, are not exact.
+_AT_REST = np.array([1e-3, 1e-2])
 _SAME = 1e-6  # of the extent, and of the largest speed and acceleration, at both ends of a path that is closed
 
 
@@ -91,6 +93,11 @@ class Blended:
         return math.inf if isinstance(self.repeat, str) else self.repeat
 
     @property
+    def later(self) -> float:
+        """How much later than its path's own times, taken ``time_scale`` times as long, it comes [s]."""
+        return self.time_scale * self._blends[0] / 2
+
+    @property
     def full_speed(self) -> tuple[float, float, float]:
         """When the first blend ends, how long a lap takes from then on, and when the last blend begins [s]."""
         start, end = self._blends
@@ -162,14 +169,14 @@ class Blended:
     def _require_rest(self) -> None:
         speeds = np.linalg.norm(self._ends[:, 1], axis=1)
         for name, given, speed in zip(("start", "end"), (self.start, self.end), speeds, strict=True):
-            if given == 0.0 and speed > _AT_REST * self._scale[1]:
+            if given == 0.0 and speed > _AT_REST[0] * self._scale[1]:
                 raise ModelError(
                     f"{name} = 0, but there the path moves at {speed:.3g} m/s, and its velocity would jump; give "
                     f"{name} some time, or leave it out",
                     key=name,
                 )
         taken = sum(self._blends) / 2
-        if taken > self._own * (1.0 + _AT_REST):
+        if taken > self._own * (1.0 + 1e-9):
             raise ModelError(
                 f"start and end are {self._blends[0]:g} and {self._blends[1]:g} s, of which half, {taken:g} s, passes "
                 f"on the path, and that takes {self._own:g} s; make them shorter",
