@@ -307,6 +307,29 @@ def test_a_controller_says_what_it_makes_of_its_input(units):
 
 @needs_compiler
 @pytest.mark.slow
+def test_a_reference_may_be_handed_in(subject, units):
+    """The scene's own gives the same bits; where none is wanted to move, the robot stays, whatever the scene says."""
+    track, names = subject.work.track, [v.name for v in layout(subject, "controller").inputs["WINDOW"]]
+    own, given, held, plant = units("controller"), units("controller"), units("controller"), units("plant")
+    rest, last = plant.get(MEASURED), subject.scene.n_periods
+    x, still = rest, np.concatenate([rest, [0.0, 0.0, 0.0, 0.0]])
+    held.set({"reference.given": 1.0} | dict(zip(names, np.tile(still, subject.tuning.horizon), strict=True)))
+    for k in range(60):
+        given.set({"reference.given": 1.0} | dict(zip(names, track.window(k, 0).ravel(), strict=True)))
+        u = own.decide(k, x)
+        assert np.array_equal(given.decide(k, x), u), k
+        assert np.abs(held.decide(k, rest)).max() < 1e-6
+        x = plant.move(k, u)
+    assert last > 60
+    assert np.abs(u).max() > 1e-2
+    given.set({"reference[1].q[0]": np.nan})
+    with pytest.raises(fmpy.fmi1.FMICallException):
+        given.decide(60, x)
+    assert "input reference[1].q[0] is nan" in given.said[-1]
+
+
+@needs_compiler
+@pytest.mark.slow
 def test_tunable_numbers_are_those_of_python(subject, units):
     """A plant with other numbers is Plant of another robot; a controller with other weights is that of `retune`."""
     scene = subject.scene

@@ -170,6 +170,7 @@ def _controller(subject: Subject) -> Layout:
     inputs["Q"] = _each("q", "rad", "measured angle, NaN if not measured, of motor", n, pose.q)
     states = ["p_x", "p_y", "v_x", "v_y", *(f"q[{i}]" for i in range(n))]
     units = ["m", "m", "m/s", "m/s", *["rad"] * n]
+    inputs |= _window(subject, states, units)
     outputs = {
         "U": _each("u", "rad/s", "rate for motor", n),
         "RESIDUALS": [
@@ -199,6 +200,21 @@ def _controller(subject: Subject) -> Layout:
     }  # fmt: skip
     return Layout("controller", inputs, _start(subject), {"PARAMETERS": _parameters(subject)}, outputs,
                   {name: [variable] for name, variable in wholes.items()})  # fmt: skip
+
+
+def _window(subject: Subject, states: list[str], units: list[str]) -> dict[str, list[Variable]]:
+    """The reference that may be handed in, and whether it is."""
+    n, horizon = subject.robot.n_rods, subject.tuning.horizon
+    names = [*states, *(f"u[{i}]" for i in range(n)), "force_x", "force_y"]
+    units = [*units, *["rad/s"] * n, "N", "N"]
+    given = Variable("reference.given", "", "0: the scene's own reference is followed; else what reference[k] say", 0.0)
+    rows = [
+        Variable(f"reference[{k}].{name}", unit, f"{name} wanted in the period {k} later; a state or a force at "
+                 "its end", float(start))
+        for k, row in enumerate(subject.work.track.window(0, subject.work.delay)[:horizon])
+        for name, unit, start in zip(names, units, row, strict=True)
+    ]  # fmt: skip
+    return {"GIVEN": [given], "WINDOW": rows}
 
 
 def _parameters(subject: Subject) -> list[Variable]:

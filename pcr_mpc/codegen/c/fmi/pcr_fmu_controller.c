@@ -79,6 +79,14 @@ static fmu_status decide(fmu *instance)
     memcpy(measured.v, in + FMU_V, sizeof measured.v);
 #endif
     memcpy(measured.q, in + FMU_Q, sizeof measured.q);
+    if (in[FMU_GIVEN] != 0.0) {
+        for (int i = FMU_GIVEN; i < FMU_INPUTS_END; i++) {
+            if (!isfinite(in[i])) {
+                return fmu_say(instance, FMU_ERROR, "at %.9g s: the input %s is %g", state->time, pcr_fmu_inputs[i], in[i]);
+            }
+        }
+        measured.window = in + FMU_WINDOW;
+    }
     const pcr_result result = pcr_controller_step(&state->part, &measured, &output);
     if (result != PCR_OK) {
         return fmu_say(instance, FMU_ERROR, "at %.9g s: the first measurement, p = (%g, %g) m, is in "
