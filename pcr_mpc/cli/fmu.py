@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -44,5 +45,5 @@ def fmu(options: argparse.Namespace) -> int:
         return 0
     print(f"{path}: {options.part} of scene {scene.name}, FMI {options.version}.0 for co-simulation, "
           f"{summary['kB']} kB; its steps are of {step:g} s\n")  # fmt: skip
-    print("To look at it: pip install fmpy, and fmpy info " + str(path))
+    print("To look at it: pip install fmpy, and fmpy info " + shlex.quote(str(path)))
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -49,5 +50,6 @@ def generate(options: argparse.Namespace) -> int:
         print(f"\nC of scene {scene.name}, controller {subject.tuning.name}, is in {folder}; to build and run it:\n")
         if loss is not None:
             print(f"  single precision: {loss}\n")
-        print(f"  make -C {folder} && {folder / 'example'}\n\n{folder / 'README.md'} says how to use it")
+        place = shlex.quote(str(folder))
+        print(f"  make -C {place} && {place}/example\n\n{folder / 'README.md'} says how to use it")
     return 0

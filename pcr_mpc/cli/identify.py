@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 from pathlib import Path
 
 from .. import interrupt
@@ -102,7 +103,8 @@ def excite_robot(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(excitation_record(found, files)))
     else:
-        print(f"\n{excitation_table(found)}\n\nwritten to {folder}; record it with: pcr-mpc track {folder / SCENE}")
+        place = shlex.quote(str(folder / SCENE))
+        print(f"\n{excitation_table(found)}\n\nwritten to {folder}; record it with: pcr-mpc track {place}")
     if problem:
         raise OutputError(problem, path=str(folder))
     require_readable(folder / SCENE)

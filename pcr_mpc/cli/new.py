@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 import tempfile
 from dataclasses import replace
@@ -50,7 +51,7 @@ def new(options: argparse.Namespace) -> int:
     found.remarks += about_wish(wish, found.robot)
     written = {name: str(folder / name) for name in _NAMES}
     print(json.dumps(new_record(chosen, found, written)) if options.json else new_table(chosen, found))
-    scene = folder / "scene.toml"
+    scene = shlex.quote(str(folder / "scene.toml"))
     print(f"\nwritten to {folder}; next: pcr-mpc check {scene}, pcr-mpc track {scene}", file=sys.stderr)
     return _verdict(found, shown=not options.json)
 

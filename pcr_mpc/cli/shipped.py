@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -55,7 +56,7 @@ def copy(options: argparse.Namespace) -> int:
         "robot.toml": "pcr-mpc check {0}",
         "tuning.toml": "pcr-mpc track SCENE --controller {0}",
     }
-    print(f"next: {following[first].format(folder / first)}", file=sys.stderr)
+    print(f"next: {following[first].format(shlex.quote(str(folder / first)))}", file=sys.stderr)
     return 0
 
 

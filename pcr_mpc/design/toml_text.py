@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 from .sizing import Design
 
 # Of the tuning of the lemniscate, which bears a robot that is not quite as believed; its units of length and time.
@@ -22,9 +24,9 @@ def command(design: Design) -> str:
     section = {"diameter": wish.diameter} if wish.width is None else {"width": wish.width, "thickness": wish.thickness}
     given = {"rods": wish.rods, "material": wish.material, **section, "length": wish.length, "spacing": wish.spacing,
              "tip-mass": wish.tip_mass, "motor": wish.motor}  # fmt: skip
-    options = (f"--{key} {value:g}" if isinstance(value, float) else f"--{key} {value}"
-               for key, value in given.items() if value is not None)  # fmt: skip
-    return " ".join([f"pcr-mpc new {wish.name}", *options])
+    options = [(f"--{key}", f"{value:g}" if isinstance(value, float) else str(value))
+               for key, value in given.items() if value is not None]  # fmt: skip
+    return shlex.join(["pcr-mpc", "new", wish.name, *(word for option in options for word in option)])
 
 
 def robot_text(design: Design) -> str:

@@ -97,6 +97,10 @@ def test_a_copy_overwrites_nothing(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["tuning.toml"]
     assert main(["copy", "lemniscate", str(tmp_path), "--force"]) == 0
     assert load_tuning(tmp_path / "tuning.toml").name == "lemniscate"
+    capsys.readouterr()
+    assert main(["copy", "lemniscate", str(tmp_path / "a copy")]) == 0
+    scene = str(tmp_path / "a copy" / "scene.toml")
+    assert capsys.readouterr().err == f"next: pcr-mpc check '{scene}', pcr-mpc track '{scene}'\n"
 
 
 def test_commands_take_names(tmp_path, capsys, monkeypatch):

@@ -5,6 +5,7 @@ import io
 import json
 import math
 import re
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -153,14 +154,16 @@ def test_nothing_is_overwritten(mine, capsys):
 
 def test_json_says_what_was_chosen(tmp_path, capsys):
     given = ["--rods", "3", "--tip-mass", "0.05", "--motor", "xm430-w210"]
-    assert main(["new", str(tmp_path / "three"), *given, "--json"]) == 0
+    assert main(["new", str(tmp_path / "three rods"), *given, "--json"]) == 0
     captured = capsys.readouterr()
     record = json.loads(captured.out)
     assert record["motor"] == "XM430-W210"
     assert record["tip_mass_kg"] == 0.05
     assert record["peaks"]["torque"]["used"] < 1
-    assert "next: pcr-mpc check" in captured.err
-    robot = load_robot(tmp_path / "three/robot.toml")
+    following = captured.err.split("next: ")[1].splitlines()[0].split(", ")
+    scene = str(tmp_path / "three rods" / "scene.toml")
+    assert [shlex.split(one) for one in following] == [["pcr-mpc", "check", scene], ["pcr-mpc", "track", scene]]
+    robot = load_robot(tmp_path / "three rods" / "robot.toml")
     assert (robot.n_rods, robot.tip_mass, robot.torque_limit) == (3, 0.05, 1.5)
 
 
