@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from .control.motor_limits import Limits
     from .control.mpc import LinearMPC
     from .control.plan import Plan
-    from .control.qp import QuadraticProgram, Reference, build_qp
+    from .control.qp.program import QuadraticProgram, Reference, build_qp
     from .control.tuning import Tuning, load_tuning
     from .errors import (
         AmbiguousPoseError,
@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from .study.episodes.spread import Spread
     from .study.excitation.design import Excitation, excite
     from .study.identification.identify import identify
-    from .study.identification.log import Log, read_log
+    from .study.identification.logs.log import Log, read_log
     from .study.identification.result import Identification
     from .study.margins.measured import measure_delay_margin
     from .study.margins.predicted import Margins, predict_delay_margin, predict_margins
@@ -177,7 +177,7 @@ _WHERE = {
     "catalogue": ("shipped",),
     "control.mpc": ("LinearMPC",),
     "control.plan": ("Plan",),
-    "control.qp": ("QuadraticProgram", "Reference", "build_qp"),
+    "control.qp.program": ("QuadraticProgram", "Reference", "build_qp"),
     "control.motor_limits": ("Limits",),
     "control.tuning": ("Tuning", "load_tuning"),
     "errors": (
@@ -232,7 +232,7 @@ _WHERE = {
     "study.episodes.spread": ("Spread",),
     "study.excitation.design": ("Excitation", "excite"),
     "study.identification.identify": ("identify",),
-    "study.identification.log": ("Log", "read_log"),
+    "study.identification.logs.log": ("Log", "read_log"),
     "study.identification.result": ("Identification",),
     "study.margins.measured": ("measure_delay_margin",),
     "study.margins.predicted": ("Margins", "predict_delay_margin", "predict_margins"),

@@ -9,7 +9,7 @@ import numpy as np
 from experiments.statics.basin_trials import CLASSES as BASINS
 from experiments.statics.basin_trials import find_poses
 from pcr_mpc import Equilibrium, PCRError, Robot, UnreachableError, distance_to_fold, solve_statics
-from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.closed_form import elastica
 from tests.rods import taylor_rod
 
 # gentle, bent and taut as in `basins`. near fold: a gentle or bent pose moved in a random direction of tip and motors

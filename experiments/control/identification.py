@@ -34,7 +34,7 @@ from pcr_mpc.study.episodes.episodes import Spread, lighter
 from pcr_mpc.study.episodes.parallel import collect, local_workers
 from pcr_mpc.study.episodes.provenance import described, source_digest
 from pcr_mpc.study.identification.identify import identify
-from pcr_mpc.study.identification.log import Log
+from pcr_mpc.study.identification.logs.log import Log
 
 Row = dict[str, Any]
 MODELS = Path(__file__).parents[2] / "models"

@@ -18,8 +18,8 @@ from pcr_mpc import (
     assess_stability,
     solve_statics,
 )
-from pcr_mpc.plant.rods import elastica
-from pcr_mpc.plant.rods.chart import critical_load
+from pcr_mpc.plant.rods.closed_form import elastica
+from pcr_mpc.plant.rods.closed_form.chart import critical_load
 from pcr_mpc.plant.rods.equations import sample_rod
 
 Row = dict[str, Any]

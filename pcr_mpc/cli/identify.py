@@ -12,8 +12,8 @@ from ..errors import IdentificationError, OutputError
 from ..files import require_folder, require_free, results, saved
 from ..loop.scene.file import load_scene
 from ..plant.uncertainty import load_uncertainty
-from ..report.excitation import excitation_record, excitation_table, plot_excitation
-from ..report.identification import (
+from ..report.studies.excitation import excitation_record, excitation_table, plot_excitation
+from ..report.studies.identification import (
     identification_comments,
     identification_record,
     identification_table,
@@ -23,7 +23,7 @@ from ..study.episodes.provenance import commit
 from ..study.excitation.design import excite
 from ..study.excitation.file import PATH, SCENE, require_readable, write_path, write_scene
 from ..study.identification.identify import identify
-from ..study.identification.log import Log, read_log
+from ..study.identification.logs.log import Log, read_log
 from ..study.identification.robot_file import robot_path, write_robot
 
 _FILES = ("identification.json", "identification.png")

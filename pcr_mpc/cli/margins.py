@@ -10,7 +10,7 @@ from ..control.tuning import load_tuning
 from ..errors import OutputError
 from ..files import require_folder, results, saved
 from ..loop.scene.file import load_scene
-from ..report.margins import margins_table, plot_margins
+from ..report.studies.margins import margins_table, plot_margins
 from ..study.margins.side_by_side import compare_margins
 
 

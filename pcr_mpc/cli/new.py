@@ -20,8 +20,8 @@ from ..files import require_absent, require_free, write_text
 from ..loop.demand.feasibility import check_scene
 from ..loop.scene.file import load_scene
 from ..plant.robot import load_robot
-from ..report.check_tables import check_record, check_table
-from ..report.new_table import new_record, new_table
+from ..report.designs.check_tables import check_record, check_table
+from ..report.designs.new_table import new_record, new_table
 from ..toml_table import read_toml
 from .behind import file_behind
 
@@ -92,7 +92,7 @@ def check(options: argparse.Namespace) -> int:
     found.remarks = [_with_file(one, options) for one in found.remarks]
     print(json.dumps(check_record(found)) if options.json else check_table(found))
     if options.picture:
-        from ..report.check_picture import plot_check
+        from ..report.designs.check_picture import plot_check
 
         plot_check(found, options.picture)
         print(f"drawn in {options.picture}", file=sys.stderr)

@@ -14,7 +14,7 @@ from ..errors import OutputError, PCRError, cause
 from ..files import require_free, saved, stamped, write_text
 from ..loop.scene.file import load_scene
 from ..loop.scene.scene import Scene
-from ..report.plan_table import LIGHT, plan_table
+from ..report.designs.plan_table import LIGHT, plan_table
 from ..study.planning.limits import PlanLimits
 from ..study.planning.plan import plan_timing, rods_left_out
 from ..study.planning.timed_path import TimedPath
@@ -51,7 +51,7 @@ def plan(options: argparse.Namespace) -> int:
     def write(folder: Path) -> None:
         write_text(folder / out.name, stamped(planned.csv()))
         if picture is not None:
-            from ..report.planning import plot_plan  # of Matplotlib, which takes a second to import
+            from ..report.designs.plan_picture import plot_plan  # of Matplotlib, which takes a second to import
 
             plot_plan(planned, folder / picture.name)
 

@@ -16,11 +16,11 @@ from ..files import require_folder, require_free, results, saved
 from ..loop.scene.file import load_scene
 from ..loop.scene.scene import Scene
 from ..plant.uncertainty import load_uncertainty
-from ..report.choice_tables import choice_record, choice_table
 from ..report.csv_rows import write_rows
+from ..report.studies.choice import choice_record, choice_table
+from ..report.studies.trade_off import plot_trade_off
+from ..report.studies.tuning import tuning_comments, tuning_table
 from ..report.timing import plot_timing, timing_tables
-from ..report.trade_off import plot_trade_off
-from ..report.tuning_tables import tuning_comments, tuning_table
 from ..study.choice.choice import choose
 from ..study.choice.file import require_plant_table, write_rung
 from ..study.episodes.episodes import lighter

@@ -17,9 +17,9 @@ from ..files import require_free
 from ..loop.controller.own_controller import OwnController
 from ..loop.run.run import load_run
 from ..loop.scene.file import load_scene
+from ..view.live.session import Session
 from ..view.replay import write_replay
 from ..view.server import ViewServer
-from ..view.session import Session
 
 
 def view(options: argparse.Namespace) -> int:

@@ -8,13 +8,13 @@ from typing import Any
 import casadi as ca
 
 from ..buffered import building
-from ..control.condensing import checking
 from ..control.mpc import LinearMPC
+from ..control.qp.condensing import checking
 from ..linearisation.strain_watch import strain_graphs
 from ..loop.parts.foresight_graph import Places, foresight_graph
 from ..plant.motion.plant import Plant
 from ..plant.motion.step_graph import StepModel, step_graph
-from ..plant.rods import elastica
+from ..plant.rods.closed_form import elastica
 from ..plant.rods.method import warm_calls
 
 # Kept to one translation unit, where what nobody calls falls away.

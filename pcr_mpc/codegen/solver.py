@@ -14,8 +14,8 @@ import numpy as np
 import osqp
 import scipy.sparse as sp
 
-from ..control.limited_qp import soft_pattern
-from ..control.qp import constraint_matrix
+from ..control.qp.limited import soft_pattern
+from ..control.qp.program import constraint_matrix
 from ..errors import GenerationError
 
 

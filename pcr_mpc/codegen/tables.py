@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..control.limited_qp import PENALTY
-from ..control.qp import stage_weights
+from ..control.qp.limited import PENALTY
+from ..control.qp.program import stage_weights
 from ..errors import GenerationError
 from ..linearisation.model_graph import sizes
 from ..linearisation.strain_watch import strain_graphs
@@ -19,7 +19,7 @@ from ..loop.parts.assembled import tip_noise
 from ..loop.run.untold_delay import UntoldDelay
 from ..plant.motion.step_graph import StepModel
 from ..plant.motion.step_graph import limits as step_limits
-from ..plant.rods.chart import critical_load_table
+from ..plant.rods.closed_form.chart import critical_load_table
 from ..plant.rods.numbers import Kind
 from .ctext import array, block, defines, number, structure
 from .loss import Loss

@@ -14,7 +14,7 @@ from ..linearisation.linear_model import LinearModel
 from .motor_limits import Limits
 from .mpc import lqr_rates, riccati
 from .plan import Plan
-from .qp import Reference
+from .qp.program import Reference
 from .tuning import Tuning
 
 

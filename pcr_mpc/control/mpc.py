@@ -15,12 +15,12 @@ from ..errors import InfeasibleError, checked_array, checked_vector
 from ..frozen import set_once
 from ..linearisation.linear_limits import LinearLimits
 from ..linearisation.linear_model import LinearModel, LinearModels
-from .condensing import condensing
 from .motor_limits import Limits
 from .plan import Plan
-from .qp import QuadraticProgram, Reference, assemble, model_sequence
+from .qp.condensing import condensing
+from .qp.program import QuadraticProgram, Reference, assemble, model_sequence
+from .qp.workspace import Workspace
 from .tuning import Tuning, time_unit
-from .workspace import Workspace
 
 _NOT_OF_THE_PROBLEM = ("name", "fallback", "model", "observer", "pd", "period", "learning")  # fields of a tuning
 # Between the sizes of one problem and the next: then the last one says nothing about this one.

@@ -12,8 +12,8 @@ from ..buffered import BufferedFunction
 from ..frozen import Remade, set_once
 from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
-from ..plant.rods import elastica
-from ..plant.rods.chart import LEAST_CRITICAL_LOAD, critical_load, critical_load_slope, rough_critical_load
+from ..plant.rods.closed_form import elastica
+from ..plant.rods.closed_form.chart import LEAST_CRITICAL_LOAD, critical_load, critical_load_slope, rough_critical_load
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.state import RobotState
 from .linear_limits import KINDS, LinearLimits, Rows

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..errors import PCRError
-from .session import Session
+from .live.session import Session
 
 LONGEST = 2048  # bytes of a message
 _FAR = 1e3  # m and rad: beyond that nothing is meant

@@ -16,8 +16,8 @@ from ..plant.robot import Robot
 from ..plant.rods.equations import sample_rod
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.stability import rod_margins
-from .session import FASTEST, SLOWEST, Session
-from .settings import NAMES
+from .live.session import FASTEST, SLOWEST, Session
+from .live.settings import NAMES
 
 POINTS = 33  # of a centreline
 _TOLD = 6  # last events in a frame: a page that misses frames misses no event

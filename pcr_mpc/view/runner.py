@@ -15,7 +15,7 @@ from ..errors import OutputError, PCRError
 from ..files import saved
 from .commands import LATEST, SLOW, Message, apply
 from .frames import about, frame
-from .session import Session
+from .live.session import Session
 
 FRAMES = 60.0  # a second
 _WAKE = 0.002  # s, between looks at the clock

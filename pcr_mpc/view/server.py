@@ -20,10 +20,10 @@ from ..errors import OutputError, PCRError
 from ..plant.robot import Robot
 from .commands import LONGEST, MessageError, read
 from .door import answer, cannot_listen, is_loopback, is_socket, refusal, require_address
+from .live.session import Session
 from .pages import Page, quiet, text_of
 from .runner import Runner
 from .scenery import Scenery
-from .session import Session
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection

@@ -12,7 +12,7 @@ from pcr_mpc.errors import NoRungError
 from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.parts.controllers import Replay
 from pcr_mpc.loop.scene.settings import Need, PlantSettings
-from pcr_mpc.report.choice_tables import choice_record, choice_table
+from pcr_mpc.report.studies.choice import choice_record, choice_table
 from pcr_mpc.study.choice.choice import Bench, Measured, apart, choose, lowest
 from pcr_mpc.study.choice.estimates import Estimates
 from pcr_mpc.study.choice.rungs import all_physics, discretisations, ladders, levels, named

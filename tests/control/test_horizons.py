@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pcr_mpc import ModelError, build_qp, load_scene, load_tuning, make_controller, simulate
-from pcr_mpc.control.condensing import _UNROLLED
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
+from pcr_mpc.control.qp.condensing import _UNROLLED
 from tests.conftest import CONTROLLERS, MODELS
 from tests.solvers.test_qp import DT, cost, full, model, problem  # noqa: F401  a fixture
 

@@ -14,11 +14,11 @@ from pcr_mpc import (
     make_controller,
     simulate,
 )
-from pcr_mpc.control.limited_qp import LimitedQP
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
-from pcr_mpc.control.osqp_solver import QPSolver
-from pcr_mpc.control.qp import build_qp
+from pcr_mpc.control.qp.limited import LimitedQP
+from pcr_mpc.control.qp.osqp_solver import QPSolver
+from pcr_mpc.control.qp.program import build_qp
 from tests.conftest import CONTROLLERS, MODELS
 
 DT, RATE, CHANGE = 0.01, 6.0, 1.0

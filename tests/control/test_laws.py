@@ -8,7 +8,7 @@ import pytest
 from pcr_mpc import Plant, inverse_statics, linearise, load_scene, load_tuning, make_controller, simulate
 from pcr_mpc.control.laws import LQR, PD, FeedForward
 from pcr_mpc.control.motor_limits import Limits
-from pcr_mpc.control.qp import Reference
+from pcr_mpc.control.qp.program import Reference
 from tests.conftest import CONTROLLERS, MODELS
 
 DT = 0.01

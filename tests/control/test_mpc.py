@@ -54,7 +54,7 @@ def test_leaving_rows_out_first_changes_nothing(tuning, target, model, reference
     """The plan under active limits on the change of rate equals that of the whole QP."""
     from pcr_mpc import build_qp
     from pcr_mpc.control.mpc import terminal_weight
-    from pcr_mpc.control.osqp_solver import QPSolver
+    from pcr_mpc.control.qp.osqp_solver import QPSolver
 
     tuning = replace(tuning, tolerance=1e-9)
     limits = Limits(3.0, 0.5, *pair.angle_limits.T)

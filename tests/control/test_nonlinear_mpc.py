@@ -17,10 +17,10 @@ from pcr_mpc import (
     load_scene,
     load_tuning,
 )
-from pcr_mpc.control import nlp_solver
-from pcr_mpc.control.collocation import gauss_tableau
 from pcr_mpc.control.motor_limits import Limits
-from pcr_mpc.control.nonlinear_mpc import NonlinearMPC
+from pcr_mpc.control.nonlinear import nlp_solver
+from pcr_mpc.control.nonlinear.collocation import gauss_tableau
+from pcr_mpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from pcr_mpc.plant.statics.symbolic import rod_unknowns, symbolic_dynamics
 from tests.conftest import CONTROLLERS, MODELS
 

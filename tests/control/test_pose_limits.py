@@ -19,16 +19,16 @@ from pcr_mpc import (
     simulate,
     solve_statics,
 )
-from pcr_mpc.control.limited_qp import LimitedQP
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
-from pcr_mpc.control.qp import Reference, build_qp
-from pcr_mpc.control.workspace import Check
+from pcr_mpc.control.qp.limited import LimitedQP
+from pcr_mpc.control.qp.program import Reference, build_qp
+from pcr_mpc.control.qp.workspace import Check
 from pcr_mpc.linearisation.linear_limits import LinearLimits
 from pcr_mpc.linearisation.linear_model import LinearModels
 from pcr_mpc.linearisation.pose_limits import LimitWatch, PoseLimits
 from pcr_mpc.loop.references.trajectory import PickAndPlace
-from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.closed_form import elastica
 from tests.conftest import CONTROLLERS, MODELS
 
 DT = 0.01

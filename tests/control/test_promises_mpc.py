@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from pcr_mpc import InfeasibleError, LinearMPC, Plant, Reference, Tuning, linearise, load_tuning
-from pcr_mpc.control.limited_qp import LimitedQP
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
-from pcr_mpc.control.qp import build_qp
-from pcr_mpc.control.workspace import Workspace
+from pcr_mpc.control.qp.limited import LimitedQP
+from pcr_mpc.control.qp.program import build_qp
+from pcr_mpc.control.qp.workspace import Workspace
 from pcr_mpc.linearisation.linear_limits import LinearLimits
 from pcr_mpc.linearisation.linear_model import LinearModels
 from tests.conftest import CONTROLLERS

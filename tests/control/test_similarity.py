@@ -18,7 +18,7 @@ from pcr_mpc import (
     solve_statics,
 )
 from pcr_mpc.control.mpc import riccati
-from pcr_mpc.control.nonlinear_mpc import NonlinearMPC
+from pcr_mpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from pcr_mpc.control.observer import DisturbanceObserver
 from pcr_mpc.linearisation.pose_limits import LimitWatch, PoseLimits
 from pcr_mpc.loop.controller.make_controller import make_controller

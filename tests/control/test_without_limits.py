@@ -8,10 +8,10 @@ import pytest
 from scipy.optimize import minimize
 
 from pcr_mpc import InfeasibleError, LinearMPC, Reference, build_qp, load_tuning
-from pcr_mpc.control.condensing import without_limits
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
-from pcr_mpc.control.qp_solver import CheckedQP
+from pcr_mpc.control.qp.checked import CheckedQP
+from pcr_mpc.control.qp.condensing import without_limits
 from pcr_mpc.linearisation.linear_limits import LinearLimits
 from tests.conftest import CONTROLLERS
 
@@ -58,7 +58,7 @@ def test_the_optimum_is_that_of_other_methods_and_no_solver_is_asked(horizon, so
     assert (plan.iterations, plan.primal_residual) == (1, 0.0)
     assert plan.dual_residual == pytest.approx(np.abs(hessian @ plan.inputs.ravel() + q).max(), abs=1e-9)
     # The solver, which is asked where this path is shut, is as near as it says.
-    monkeypatch.setattr("pcr_mpc.control.workspace.Workspace._without_limits", lambda *_: None)
+    monkeypatch.setattr("pcr_mpc.control.qp.workspace.Workspace._without_limits", lambda *_: None)
     asked = LinearMPC(tuning, wide).solve(x, model, at_rest(target, tuning), NONE)
     assert asked.inputs == pytest.approx(plan.inputs, abs=1e-3 if solver == "osqp" else 1e-8)
 

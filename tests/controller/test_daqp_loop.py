@@ -15,13 +15,13 @@ from pcr_mpc import (
     make_controller,
     simulate,
 )
-from pcr_mpc.control import workspace
-from pcr_mpc.control.daqp_solver import DAQPSolver
-from pcr_mpc.control.limited_qp import LimitedQP
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.control.mpc import terminal_weight
-from pcr_mpc.control.osqp_solver import QPSolver
-from pcr_mpc.control.qp import build_qp
+from pcr_mpc.control.qp import workspace
+from pcr_mpc.control.qp.daqp_solver import DAQPSolver
+from pcr_mpc.control.qp.limited import LimitedQP
+from pcr_mpc.control.qp.osqp_solver import QPSolver
+from pcr_mpc.control.qp.program import build_qp
 from pcr_mpc.linearisation.linear_limits import LinearLimits
 from pcr_mpc.linearisation.linear_model import LinearModels
 from pcr_mpc.study.tuning.file import write_tuning

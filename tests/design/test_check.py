@@ -14,8 +14,8 @@ from pcr_mpc.design.examination import Examination, examine
 from pcr_mpc.design.reach import tips_within
 from pcr_mpc.design.remarks import Remark, about_steps, unidentifiable
 from pcr_mpc.loop.references.trajectory import Hold
-from pcr_mpc.report.check_picture import plot_check
-from pcr_mpc.report.check_tables import check_table
+from pcr_mpc.report.designs.check_picture import plot_check
+from pcr_mpc.report.designs.check_tables import check_table
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import pytest
 from pcr_mpc import CompilerError, PCRError, Plant
 from pcr_mpc.buffered import BufferedFunction, listed
 from pcr_mpc.compiled import compiled, fastest, has_compiler
-from pcr_mpc.plant.rods.elastica import rod_newton
+from pcr_mpc.plant.rods.closed_form.elastica import rod_newton
 
 NOT_ROOT = pytest.mark.skipif(hasattr(os, "getuid") and os.getuid() == 0, reason="root may write anywhere")
 

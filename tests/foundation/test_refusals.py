@@ -11,10 +11,10 @@ from pcr_mpc import ConvergenceError, ModelError, PCRError, Plant, forward_stati
 from pcr_mpc.buffered import BufferedFunction
 from pcr_mpc.cli.study import _ended
 from pcr_mpc.compiled import compiled
-from pcr_mpc.control.daqp_solver import DAQPSolver
-from pcr_mpc.control.nonlinear_mpc import NonlinearMPC
-from pcr_mpc.control.osqp_solver import QPSolver
-from pcr_mpc.control.qp import constraint_matrix
+from pcr_mpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
+from pcr_mpc.control.qp.daqp_solver import DAQPSolver
+from pcr_mpc.control.qp.osqp_solver import QPSolver
+from pcr_mpc.control.qp.program import constraint_matrix
 from pcr_mpc.errors import CompilerError, OutputError
 from pcr_mpc.files import require_free
 from pcr_mpc.linearisation.linear_model import column_size, n_states

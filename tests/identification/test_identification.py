@@ -15,8 +15,8 @@ from pcr_mpc.plant.uncertainty import load_uncertainty
 from pcr_mpc.study.identification.balance import imbalance
 from pcr_mpc.study.identification.first_guess import first_guess, pieces_of
 from pcr_mpc.study.identification.identify import identify
-from pcr_mpc.study.identification.log import Log, read_log
-from pcr_mpc.study.identification.log_checks import checked_log, delay_in_angles
+from pcr_mpc.study.identification.logs.checks import checked_log, delay_in_angles
+from pcr_mpc.study.identification.logs.log import Log, read_log
 from pcr_mpc.study.identification.parameters import catalogue, chosen
 from pcr_mpc.study.identification.prediction import Predictor
 from pcr_mpc.study.identification.problem import Noise, Problem

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import Plant, Uncertainty, load_scene, make_controller, rollout, simulate
-from pcr_mpc.report.choice_tables import choice_record, choice_table
+from pcr_mpc.report.studies.choice import choice_record, choice_table
 from pcr_mpc.study.choice.choice import Choice, Measured
 from pcr_mpc.study.choice.estimates import Estimates
 from pcr_mpc.study.choice.numbers_cost import NumbersCost, assumed_uncertainty, numbers_cost

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcr_mpc import LogError, identify, inverse_statics, load_robot, read_log, solve_statics
-from pcr_mpc.study.identification.log_checks import checked_log
+from pcr_mpc.study.identification.logs.checks import checked_log
 from pcr_mpc.study.identification.parameters import robot_with
 from pcr_mpc.study.identification.torques import torques_along
 from tests.conftest import MODELS

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import Plant, forward_statics, linearise
-from pcr_mpc.plant.rods import elastica, inertia, shooting_inertia
+from pcr_mpc.plant.rods.closed_form import elastica, inertia
+from pcr_mpc.plant.rods.shooting import inertia as shooting_inertia
 
 from .test_inertia import kinetic_energy, rollout, started, state
 

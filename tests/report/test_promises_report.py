@@ -11,7 +11,8 @@ from pcr_mpc import HoldMotors, load_scene, load_tuning, simulate
 from pcr_mpc.cli import main
 from pcr_mpc.cli import study as cli_study
 from pcr_mpc.plant.statics.stability import assess_stability
-from pcr_mpc.report.choice_tables import choice_record, choice_table
+from pcr_mpc.report.studies.choice import choice_record, choice_table
+from pcr_mpc.report.studies.tuning import tuning_comments, tuning_table
 from pcr_mpc.report.tables import (
     equilibria_table,
     equilibrium_record,
@@ -20,7 +21,6 @@ from pcr_mpc.report.tables import (
     table,
     times_table,
 )
-from pcr_mpc.report.tuning_tables import tuning_comments, tuning_table
 from pcr_mpc.study.choice.choice import Choice, Measured
 from pcr_mpc.study.choice.estimates import Estimate
 from pcr_mpc.study.choice.rungs import all_physics

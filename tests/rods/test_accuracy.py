@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pcr_mpc import solve_statics
-from pcr_mpc.plant.rods import elastica
-from pcr_mpc.plant.rods.chart import critical_load
+from pcr_mpc.plant.rods.closed_form import elastica
+from pcr_mpc.plant.rods.closed_form.chart import critical_load
 from tests.conftest import random_pose
 
 from . import taylor_rod

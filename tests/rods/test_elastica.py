@@ -6,10 +6,10 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from pcr_mpc import solve_statics
-from pcr_mpc.plant.rods import elastica
-from pcr_mpc.plant.rods.chart import held_shapes
+from pcr_mpc.plant.rods.closed_form import elastica
+from pcr_mpc.plant.rods.closed_form.chart import held_shapes
+from pcr_mpc.plant.rods.closed_form.pendulum import swing_with_slopes
 from pcr_mpc.plant.rods.equations import sample_rod
-from pcr_mpc.plant.rods.pendulum import swing_with_slopes
 from tests.conftest import DATA
 
 

@@ -5,9 +5,9 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from pcr_mpc import load_robot, solve_statics
-from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.closed_form import elastica
 from pcr_mpc.plant.rods.equations import propagation, sample_rod
-from pcr_mpc.plant.rods.multiple_shooting import robot_residual, rod_newton
+from pcr_mpc.plant.rods.shooting.multiple_shooting import robot_residual, rod_newton
 from tests.conftest import DATA, MODELS
 
 

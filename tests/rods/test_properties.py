@@ -28,7 +28,7 @@ from pcr_mpc import (
     solve_statics,
 )
 from pcr_mpc.control.motor_limits import Limits
-from pcr_mpc.control.qp import Reference
+from pcr_mpc.control.qp.program import Reference
 from tests.conftest import CONTROLLERS, MODELS
 
 from .rod_check import TOLERANCE, residuals

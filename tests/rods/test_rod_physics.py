@@ -19,10 +19,10 @@ from pcr_mpc import (
     simulate,
     solve_statics,
 )
-from pcr_mpc.plant.rods.elastica import tip_map
+from pcr_mpc.plant.rods.closed_form.elastica import tip_map
 from pcr_mpc.plant.rods.equations import Layout, RodPhysics, propagation, sample_rod
-from pcr_mpc.plant.rods.multiple_shooting import rod_newton
 from pcr_mpc.plant.rods.physics import robot_physics
+from pcr_mpc.plant.rods.shooting.multiple_shooting import rod_newton
 from pcr_mpc.plant.statics.stability import count_conjugate_points
 from pcr_mpc.plant.statics.weight import _rod_weight
 from tests.conftest import MODELS

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from pcr_mpc import ConvergenceError, Plant, UnstableError, forward_statics, solve_statics
-from pcr_mpc.plant.rods import elastica
-from pcr_mpc.plant.rods.chart import critical_load
+from pcr_mpc.plant.rods.closed_form import elastica
+from pcr_mpc.plant.rods.closed_form.chart import critical_load
 
 from .test_elastica import by_mpmath
 

@@ -6,8 +6,8 @@ import scipy.sparse as sp
 from scipy.optimize import minimize
 
 from pcr_mpc import InfeasibleError
-from pcr_mpc.control.daqp_solver import DAQPSolver
-from pcr_mpc.control.osqp_solver import QPSolver
+from pcr_mpc.control.qp.daqp_solver import DAQPSolver
+from pcr_mpc.control.qp.osqp_solver import QPSolver
 
 from .qp_check import by_enumeration, packed
 
@@ -266,7 +266,7 @@ def test_small_violations_count():
 def test_run_time_counts_updates_starts_and_solves(solver, monkeypatch):
     """By a clock that ticks with every look at it."""
     ticks = iter(range(100))
-    monkeypatch.setattr("pcr_mpc.control.daqp_solver.time.perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr("pcr_mpc.control.qp.daqp_solver.time.perf_counter", lambda: float(next(ticks)))
     solver.update(**data()[0])
     solver.warm_start(np.zeros(N), np.zeros(M))
     assert solver.solve().run_time == 3.0

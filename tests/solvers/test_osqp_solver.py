@@ -6,7 +6,7 @@ import scipy.sparse as sp
 from scipy.optimize import minimize
 
 from pcr_mpc import InfeasibleError
-from pcr_mpc.control.osqp_solver import QPSolver
+from pcr_mpc.control.qp.osqp_solver import QPSolver
 
 N, M = 4, 6
 

@@ -8,11 +8,11 @@ import pytest
 import scipy.sparse as sp
 
 from pcr_mpc import InfeasibleError, LinearModel, Reference, build_qp, load_tuning
-from pcr_mpc.control.limited_qp import LimitedQP
 from pcr_mpc.control.motor_limits import Limits
-from pcr_mpc.control.nlp_solver import Point
-from pcr_mpc.control.nonlinear_mpc import NonlinearMPC
-from pcr_mpc.control.osqp_solver import QPSolver
+from pcr_mpc.control.nonlinear.nlp_solver import Point
+from pcr_mpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
+from pcr_mpc.control.qp.limited import LimitedQP
+from pcr_mpc.control.qp.osqp_solver import QPSolver
 from pcr_mpc.linearisation.linear_model import LinearModels
 from tests.conftest import CONTROLLERS
 

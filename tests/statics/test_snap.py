@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from pcr_mpc import Plant, all_equilibria, load_scene, make_controller, simulate, solve_statics
-from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.closed_form import elastica
 from pcr_mpc.plant.rods.snap import landing
 from pcr_mpc.plant.statics.stability import count_conjugate_points
 from tests.conftest import MODELS

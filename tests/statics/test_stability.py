@@ -13,10 +13,10 @@ from pcr_mpc import (
     inverse_statics,
     solve_statics,
 )
-from pcr_mpc.plant.rods import elastica
-from pcr_mpc.plant.rods.chart import critical_load, stable_shapes
+from pcr_mpc.plant.rods.closed_form import elastica
+from pcr_mpc.plant.rods.closed_form.chart import critical_load, stable_shapes
 from pcr_mpc.plant.rods.equations import sample_rod
-from pcr_mpc.plant.rods.multiple_shooting import rod_newton
+from pcr_mpc.plant.rods.shooting.multiple_shooting import rod_newton
 from pcr_mpc.plant.statics.stability import count_conjugate_points
 from tests.conftest import DATA, random_pose
 

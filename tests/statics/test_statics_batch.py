@@ -12,7 +12,7 @@ from pcr_mpc import (
     solve_statics,
     solve_statics_batch,
 )
-from pcr_mpc.plant.rods import elastica
+from pcr_mpc.plant.rods.closed_form import elastica
 from pcr_mpc.plant.rods.equations import sample_rod
 from tests.conftest import MODELS
 

@@ -10,7 +10,7 @@ from pcr_mpc.errors import MarginsError
 from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.references.trajectory import Hold
-from pcr_mpc.report.margins import margins_table, plot_margins
+from pcr_mpc.report.studies.margins import margins_table, plot_margins
 from pcr_mpc.study.margins.linear_loop import LinearLoop
 from pcr_mpc.study.margins.measured import PushTest, held_scene, measure_delay_margin, push_dies_away
 from pcr_mpc.study.margins.poses import LinearLoops, scaled, scaled_scene

@@ -32,7 +32,7 @@ from pcr_mpc.cli import main
 from pcr_mpc.linearisation.pose_limits import PoseLimits
 from pcr_mpc.loop.references.tabulated import Tabulated
 from pcr_mpc.loop.references.trajectory import PickAndPlace, smooth_step
-from pcr_mpc.report.plan_table import plan_table
+from pcr_mpc.report.designs.plan_table import plan_table
 from pcr_mpc.study.planning import rods_mass
 from pcr_mpc.study.planning.collocation import _narrowed
 from pcr_mpc.study.planning.course import paced

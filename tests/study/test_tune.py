@@ -16,7 +16,7 @@ import pytest
 from pcr_mpc import PCRError, load_scene, load_tuning
 from pcr_mpc.cli import main
 from pcr_mpc.errors import StudyError
-from pcr_mpc.report.trade_off import pareto
+from pcr_mpc.report.studies.trade_off import pareto
 from pcr_mpc.study.episodes.episodes import EXACT, Spread
 from pcr_mpc.study.tuning import score as tuning_score
 from pcr_mpc.study.tuning import space as tuning_space

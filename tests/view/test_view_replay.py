@@ -10,9 +10,9 @@ import pytest
 
 from pcr_mpc import Plant, load_scene, make_controller, shipped, simulate
 from pcr_mpc.cli import main
+from pcr_mpc.view.live.session import Session
 from pcr_mpc.view.page import page
 from pcr_mpc.view.replay import replay_data, write_replay
-from pcr_mpc.view.session import Session
 
 
 @pytest.fixture(scope="module")

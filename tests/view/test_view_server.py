@@ -16,9 +16,9 @@ import pytest
 from pcr_mpc import load_scene
 from pcr_mpc.errors import OutputError, PCRError
 from pcr_mpc.view.commands import LONGEST, MessageError, read
+from pcr_mpc.view.live.session import Session
 from pcr_mpc.view.pages import Page
 from pcr_mpc.view.server import ViewServer
-from pcr_mpc.view.session import Session
 
 client = pytest.importorskip("websockets.sync.client")
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402

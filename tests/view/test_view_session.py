@@ -12,8 +12,8 @@ from pcr_mpc.errors import PCRError, UnstableError
 from pcr_mpc.loop.controller.own_controller import OwnController
 from pcr_mpc.loop.run.run import load_run
 from pcr_mpc.plant.statics.free_tip import forward_statics
-from pcr_mpc.study.identification.log import read_log
-from pcr_mpc.view.session import Session
+from pcr_mpc.study.identification.logs.log import read_log
+from pcr_mpc.view.live.session import Session
 from tests.view.view_check import spring_balance
 
 

@@ -15,7 +15,7 @@ from ...control.motor_limits import SAME_ANGLE, Limits
 from ...control.mpc import LinearMPC
 from ...control.observer import DisturbanceObserver
 from ...control.plan import Plan
-from ...control.qp import Reference
+from ...control.qp.program import Reference
 from ...errors import PCRError, checked_period, measured_vector
 from ...frozen import made
 from ...linearisation.linear_limits import LinearLimits

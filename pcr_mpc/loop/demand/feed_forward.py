@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from ... import interrupt
-from ...control.qp import Reference
+from ...control.qp.program import Reference
 from ...errors import ConvergenceError, PCRError, cause
 from ...frozen import Frozen
 from ...plant.motion.mass_matrix import CondensedMass

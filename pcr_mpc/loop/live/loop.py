@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...control.qp import Reference
+from ...control.qp.program import Reference
 from ...errors import PCRError, checked_vector, measured_vector
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...control.qp import Reference
+from ...control.qp.program import Reference
 from ...errors import PCRError, UnreachableError, checked_vector
 from ...plant.statics.equilibrium import Equilibrium
 from ..references.trajectory import Trajectory, sampled

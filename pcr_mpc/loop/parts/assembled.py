@@ -10,9 +10,9 @@ import numpy as np
 from ...control.laws import LQR, PD, FeedForward, Law
 from ...control.motor_limits import Limits
 from ...control.mpc import LinearMPC
-from ...control.nonlinear_mpc import NonlinearMPC
+from ...control.nonlinear.nonlinear_mpc import NonlinearMPC
 from ...control.observer import DisturbanceObserver
-from ...control.qp import motor_bounds, stage_weights
+from ...control.qp.program import motor_bounds, stage_weights
 from ...control.tuning import Model, Tuning
 from ...errors import ModelError
 from ...linearisation.linear_model import LinearModel

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...buffered import BufferedFunction
 from ...compiled import fastest, has_compiler
-from ...control.qp import QuadraticProgram, Reference, constraint_matrix
+from ...control.qp.program import QuadraticProgram, Reference, constraint_matrix
 from ...errors import ConvergenceError, PCRError
 from ...linearisation.linear_model import LinearModels
 from ...linearisation.linearise import linearise

@@ -12,8 +12,8 @@ from ...methods import METHODS
 from ...plant.materials import check_unit
 from ...plant.motion.plant import INTEGRATORS, ON_SNAP, Plant
 from ...plant.robot import Robot
+from ...plant.rods.closed_form.inertia import INERTIAS
 from ...plant.rods.equations import SCHEMES
-from ...plant.rods.inertia import INERTIAS
 from ...plant.statics.held_tip import default_method
 from ...plant.statics.weight import WEIGHTS
 from ...toml_table import Table

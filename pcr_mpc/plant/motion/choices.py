@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..robot import Robot
-from ..rods.inertia import INERTIAS
+from ..rods.closed_form.inertia import INERTIAS
 from ..statics.held_tip import default_method
 from ..statics.weight import WEIGHTS
 from .integrators import INTEGRATORS

@@ -9,8 +9,8 @@ import numpy as np
 
 from ...buffered import BufferedFunction
 from ...errors import ConvergenceError
-from . import elastica
-from .chart import critical_load, held_shapes
+from .closed_form import elastica
+from .closed_form.chart import critical_load, held_shapes
 from .equations import RodPhysics
 from .method import RodMethod, enough_nodes
 from .physics import plain_physics

@@ -12,10 +12,12 @@ import numpy as np
 
 from ...buffered import graph_cache
 from ...compiled import fastest
-from . import elastica, inertia, multiple_shooting, shooting_inertia
-from .chart import HeldShape
+from .closed_form import elastica, inertia
+from .closed_form.chart import HeldShape
 from .equations import Layout, RodPhysics, aligned_steps, sample_rod
 from .numbers import Kind
+from .shooting import inertia as shooting_inertia
+from .shooting import multiple_shooting
 
 # Graphs up to this size are inlined into the graph of the whole robot; larger ones are called by it.
 _INLINED_INSTRUCTIONS = 4000

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..robot import Robot
-from ..rods.chart import held_shapes
+from ..rods.closed_form.chart import held_shapes
 
 _OFFSETS = np.linspace(-2.6, 2.6, 40)  # clamp angle minus chord angle, of a cold inverse start [rad]
 _CANDIDATES = 24

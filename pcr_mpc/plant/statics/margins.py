@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..rods.chart import LEAST_CRITICAL_LOAD, critical_load
+from ..rods.closed_form.chart import LEAST_CRITICAL_LOAD, critical_load
 from ..rods.physics import robot_physics
 from ..rods.strain import largest_moment, largest_strain
 from .equilibria import Equilibria

@@ -12,9 +12,9 @@ from scipy.optimize import least_squares
 from ...buffered import BufferedFunction, graph_cache
 from ...errors import ConvergenceError
 from ..robot import Robot
-from ..rods.chart import held_shapes
+from ..rods.closed_form.chart import held_shapes
 from ..rods.equations import propagation
-from ..rods.multiple_shooting import invariant, robot_residual, rod_newton
+from ..rods.shooting.multiple_shooting import invariant, robot_residual, rod_newton
 from .equilibrium import Equilibrium
 
 _ACCEPTED_RESIDUAL = 1e-8

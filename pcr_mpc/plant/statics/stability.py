@@ -12,12 +12,12 @@ import numpy as np
 from ...errors import ConvergenceError, PCRError, checked_integer, checked_vector
 from ...frozen import Frozen
 from ..robot import Robot
-from ..rods import elastica
-from ..rods.chart import LEAST_CRITICAL_LOAD, HeldShape, critical_load, stable_shapes
+from ..rods.closed_form import elastica
+from ..rods.closed_form.chart import LEAST_CRITICAL_LOAD, HeldShape, critical_load, stable_shapes
 from ..rods.equations import aligned_steps, sample_rod
 from ..rods.method import closed_form_method
-from ..rods.multiple_shooting import rod_newton
 from ..rods.physics import require_plain
+from ..rods.shooting.multiple_shooting import rod_newton
 from .balance import settle
 from .equilibrium import Equilibrium
 from .free_tip import free_solver

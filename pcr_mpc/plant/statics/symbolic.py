@@ -11,9 +11,9 @@ import numpy as np
 from ...buffered import graph_cache
 from ...errors import checked_array
 from ..robot import Robot
-from ..rods.elastica import beyond_limit
+from ..rods.closed_form.elastica import beyond_limit
+from ..rods.closed_form.pendulum import pendulum
 from ..rods.method import closed_form_method
-from ..rods.pendulum import pendulum
 from ..rods.physics import require_plain
 from .equilibrium import Equilibrium
 from .solver import RodSolver

@@ -19,7 +19,7 @@ import numpy as np
 
 from ...buffered import BufferedFunction, graph_cache
 from ..robot import Robot
-from ..rods.inertia import Point, along, by_pose_of_tip, seen_along_force, turned
+from ..rods.closed_form.inertia import Point, along, by_pose_of_tip, seen_along_force, turned
 from ..rods.numbers import Kind
 from .equilibrium import Equilibrium
 

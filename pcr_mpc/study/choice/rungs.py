@@ -12,7 +12,7 @@ from itertools import product
 from ...loop.hardware.motors import IDEAL
 from ...loop.scene.scene import Scene
 from ...loop.scene.settings import MOTORS, PAYLOADS, RODS, PlantSettings
-from ...plant.rods.inertia import INERTIAS
+from ...plant.rods.closed_form.inertia import INERTIAS
 from ...plant.statics.weight import WEIGHTS
 
 # Steps in a control period: some, for what happens within it, such as a late decision. Force evaluations a step, which

@@ -19,7 +19,7 @@ from ...loop.references.trajectory import Lemniscate, Trajectory, smooth_step
 from ...loop.scene.scene import Scene
 from ...plant.uncertainty import Uncertainty
 from ..identification.information import information
-from ..identification.log import Log
+from ..identification.logs.log import Log
 from ..identification.parameters import catalogue, chosen
 from ..identification.prediction import Piece, Predictor, physics
 from ..identification.problem import Guess, Noise, Problem

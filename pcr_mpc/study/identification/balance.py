@@ -15,8 +15,8 @@ from ...errors import IdentificationError, PCRError
 from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
 from .first_guess import noise_of
-from .log import Log
-from .log_checks import unwrapped
+from .logs.checks import unwrapped
+from .logs.log import Log
 from .prediction import Predictor
 
 # Poses that are solved for each log.

@@ -11,8 +11,8 @@ import numpy as np
 from ...errors import PCRError
 from ...plant.robot import Robot
 from ...plant.statics.free_tip import inverse_statics
-from .commands import told_angles
-from .log import Log
+from .logs.commands import told_angles
+from .logs.log import Log
 from .prediction import Piece, Predictor
 from .problem import Guess, Noise
 

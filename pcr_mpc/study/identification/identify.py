@@ -15,8 +15,8 @@ from ...loop.scene.scene import Scene
 from ...plant.uncertainty import Uncertainty
 from .balance import require_balance
 from .information import Information, information
-from .log import Log
-from .log_checks import LONGEST_DELAY, checked_log, delay_in_angles
+from .logs.checks import LONGEST_DELAY, checked_log, delay_in_angles
+from .logs.log import Log
 from .parameters import Parameters, catalogue, chosen, force_names
 from .prediction import Predictor, physics
 from .problem import Noise

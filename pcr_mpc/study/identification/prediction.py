@@ -18,8 +18,8 @@ from ...plant.motion.step_limit import longest_step
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.held_tip import default_method
-from .commands import commands, filled
-from .log import Log
+from .logs.commands import commands, filled
+from .logs.log import Log
 from .parameters import Parameters, force_names
 
 # Steps of the model: RK4 at this part of the fastest swing's radian is within a hundredth of a per cent; what is left

@@ -10,7 +10,7 @@ from ...frozen import Frozen
 from ...loop.scene.scene import Scene
 from ...plant.robot import Robot
 from ...plant.uncertainty import Uncertainty
-from .log import Log
+from .logs.log import Log
 from .problem import Noise
 from .residuals import Whiteness
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...control.laws import LQR, PD, Law
 from ...control.motor_limits import Limits
 from ...control.mpc import LinearMPC, riccati
-from ...control.qp import Reference, assemble
+from ...control.qp.program import Reference, assemble
 from ...control.tuning import Tuning
 from ...linearisation.linear_model import LinearModel, LinearModels
 from .linear_plant import Sampled

@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 
 from ...buffered import BUILDING
-from ...control.collocation import gauss_tableau
+from ...control.nonlinear.collocation import gauss_tableau
 from ...errors import InfeasibleError
-from ...plant.rods.chart import LEAST_CRITICAL_LOAD
+from ...plant.rods.closed_form.chart import LEAST_CRITICAL_LOAD
 from ...plant.statics.symbolic import symbolic_statics
 from .timing import Problem
 
