@@ -10,7 +10,6 @@ import numpy as np
 
 from ..control.mpc import LinearMPC, riccati
 from ..control.tuning import Tuning
-from ..errors import GenerationError
 from ..linearisation.pose_limits import PoseLimits
 from ..loop.controller.control_step import ControlStep
 from ..loop.controller.make_controller import make_controller
@@ -73,27 +72,7 @@ class Subject:
         controller.start(pose)
         plant = scene.plant.make(scene.robot)
         plant.reset(resting_state(pose), pose)
-        subject = cls(scene, tuning, pose, controller, plant, single)
-        if single:
-            subject.check_single()
-        return subject
-
-    def check_single(self) -> None:
-        """Raise if C of this cannot be in single precision.
-
-        Raises
-        ------
-        GenerationError
-            Says what cannot.
-        """
-        models = (*self.work.foresight.step_models, self.watched, self.plant.step_model)
-        if any(model is not None and model.method.name != "closed_form" for model in models):
-            raise GenerationError(f"{self.scene.name}: single precision knows rods in closed form only, as the "
-                                  "equations of rods that are shot have a condition of 1e8; leave --float32 out",
-                                  part="float32")  # fmt: skip
-        if self.tuning.solver != "osqp":
-            raise GenerationError(f"{self.scene.name}: single precision is for OSQP only, as DAQP decides by "
-                                  "tolerances of double; take --solver osqp", part="float32")  # fmt: skip
+        return cls(scene, tuning, pose, controller, plant, single)
 
     @property
     def rounding(self) -> float:

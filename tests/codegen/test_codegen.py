@@ -1,8 +1,6 @@
 """C of plant and controller against Python: the same rates, rungs and iterations, by compilers that forgive nothing."""
 
-import os
 import re
-import shutil
 import subprocess
 from collections import Counter
 from contextlib import suppress
@@ -11,71 +9,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcr_mpc.cli import main
 from pcr_mpc.codegen.folder import write_folder
 from pcr_mpc.codegen.library import GeneratedController, build
-from pcr_mpc.codegen.scope import check_scope
 from pcr_mpc.codegen.solver import flops
 from pcr_mpc.codegen.subject import Subject
 from pcr_mpc.codegen.tables import parameters
 from pcr_mpc.codegen.timing import time_in_c, worst_case
 from pcr_mpc.codegen.vectors import recorded
-from pcr_mpc.control.observer import ObserverTuning
-from pcr_mpc.control.tuning import LearningTuning, load_tuning
-from pcr_mpc.errors import GenerationError, MeasurementError, PCRError
+from pcr_mpc.control.tuning import load_tuning
+from pcr_mpc.errors import MeasurementError, PCRError
 from pcr_mpc.loop.controller.make_controller import make_controller
 from pcr_mpc.loop.hardware.camera import Camera
 from pcr_mpc.loop.hardware.motors import Motors
 from pcr_mpc.loop.scene.file import load_scene
+from tests.codegen.conftest import CC, QUICK, SCENES, copied, generated, make, needs_compiler, run
 from tests.conftest import ROOT
-
-SCENES = ROOT / "models" / "scenes"
-CC = os.environ.get("CC") or "gcc"
-needs_compiler = pytest.mark.skipif(
-    not (shutil.which(CC) and shutil.which("make")), reason="generated C is compiled here: needs gcc and make"
-)
-# Quick to build; no optimisation may change a bit of what it computes.
-QUICK = ["CFLAGS=-O0", "GRAPH_CFLAGS=-O0"]
-INCLUDED = ["-isystem", "osqp/public", "-isystem", "osqp/private", "-isystem", "daqp/include"]
-
-
-def generated(scene, folder, solver="osqp"):
-    assert main(["generate", str(SCENES / f"{scene}.toml"), "--solver", solver, "--out", str(folder)]) == 0
-    return folder
-
-
-def make(folder, *words):
-    done = subprocess.run(["make", "-s", "-C", str(folder), f"CC={CC}", *words], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "warning" not in done.stderr, done.stderr
-    return folder
-
-
-def run(folder, *words, **more):
-    """Standard output of the example, whose exit status says whether all is as recorded."""
-    done = subprocess.run([str(folder / "example"), *words], capture_output=True, text=True, **more)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-@pytest.fixture(scope="session")
-def lemniscate(tmp_path_factory):
-    return generated("lemniscate", tmp_path_factory.mktemp("c") / "lemniscate")
-
-
-@pytest.fixture(scope="session")
-def by_daqp(tmp_path_factory):
-    return generated("lemniscate", tmp_path_factory.mktemp("daqp") / "lemniscate", "daqp")
-
-
-@pytest.fixture(params=["osqp", "daqp"])
-def each(request):
-    """A folder for each solver."""
-    return request.getfixturevalue({"osqp": "lemniscate", "daqp": "by_daqp"}[request.param])
-
-
-def copied(folder, tmp_path):
-    return shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("*.o", "*.a", "example"))
 
 
 @needs_compiler
@@ -280,16 +228,6 @@ def test_steps_in_c_are_timed_one_by_one(monkeypatch):
 
 
 @needs_compiler
-@pytest.mark.slow
-def test_sanitisers_find_nothing(each, tmp_path):
-    folder = copied(each, tmp_path)
-    checked = "-O0 -fsanitize=address,undefined -fno-sanitize-recover=all"
-    # Instructions without an index, which is what CasADi writes, take long to be checked.
-    make(folder, f"CFLAGS={checked}", "GRAPH_CFLAGS=-O0")
-    run(folder)
-
-
-@needs_compiler
 def test_the_program_of_the_readme_compiles_as_it_says(lemniscate, tmp_path):
     text = (lemniscate / "README.md").read_text()
     (tmp_path / "loop.c").write_text(re.search(r"```c\n(.*?)```", text, re.DOTALL)[1])
@@ -297,117 +235,3 @@ def test_the_program_of_the_readme_compiles_as_it_says(lemniscate, tmp_path):
     words = [CC, *line, "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only", str(tmp_path / "loop.c")]
     done = subprocess.run(words, cwd=lemniscate, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-@needs_compiler
-@pytest.mark.slow
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_no_compiler_warns_of_the_runtime(compiler, each):
-    if not shutil.which(compiler):
-        pytest.skip(f"there is no {compiler} here")
-    own = sorted(path.name for path in each.glob("*.c"))
-    assert {"main.c", "pcr_controller.c", "pcr_graphs.c", "pcr_tables.c", "pcr_qp.c"} < set(own)
-    words = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-fsyntax-only", "-I.", *INCLUDED]
-    done = subprocess.run([compiler, *words, *own], cwd=each, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-@needs_compiler
-@pytest.mark.slow
-def test_cpp_may_include_the_header(each, tmp_path):
-    if not shutil.which("g++"):
-        pytest.skip("there is no g++ here")
-    program = tmp_path / "main.cpp"
-    program.write_text('#include "pcr.h"\nint main() { static pcr_plant p; return pcr_plant_init(&p, nullptr); }\n')
-    words = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-I.", *INCLUDED]
-    done = subprocess.run(["g++", *words, str(program)], cwd=each, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-@needs_compiler
-@pytest.mark.slow
-def test_nothing_of_the_library_allocates_or_prints(each, tmp_path):
-    folder = copied(each, tmp_path)
-    make(folder, *QUICK, "size")
-    kept, whole = ((folder / name).stat().st_size for name in ("controller.linked", "libpcr.a"))
-    assert 50e3 < kept < whole
-    listed = subprocess.run(["nm", "-u", str(folder / "libpcr.a")], capture_output=True, text=True, check=True).stdout
-    needed = {line.split()[-1] for line in listed.splitlines() if " U " in f" {line}"}
-    assert "sqrt" in needed  # it lists what it should
-    banned = re.compile(r"alloc|^free$|print|put[sc]|^f?write$|errno|locale|^exit$|^abort$")
-    assert not [name for name in needed if banned.search(name)]
-    held = subprocess.run(["nm", str(folder / "libpcr.a")], capture_output=True, text=True, check=True).stdout
-    variables = [line.split() for line in held.splitlines() if re.search(r" [bBC] ", line)]
-    assert not variables  # state is in the structures alone
-
-
-NOT_IN_C = {"release": "reference"}
-
-
-@pytest.mark.parametrize("path", sorted(SCENES.glob("*.toml")), ids=lambda path: path.stem)
-def test_every_shipped_scene_is_generated_or_refused_by_name(path):
-    scene, part = load_scene(path), NOT_IN_C.get(path.stem)
-    if part is None:
-        assert check_scope(scene, scene.tuning) is scene.tuning
-        return
-    with pytest.raises(GenerationError) as error:
-        check_scope(scene, scene.tuning)
-    assert error.value.part == part
-
-
-REFUSED = {
-    "lqr": "law",
-    "nonlinear": "law",
-    "open_loop": "law",
-    "pd": "law",
-}
-
-
-@pytest.mark.parametrize(
-    ("changes", "part"),
-    [
-        ({"motors": Motors(saturated=True)}, "motors at their torque limit"),
-        ({"plant": {"on_snap": "jump"}}, "snapping plant"),
-        ({"plant": {"method": "single_shooting"}}, "method of the plant's rods"),
-        ({"plant": {"inertia": "full"}}, "inertia of the plant"),
-        ({"tuning": {"fallback": "raise"}}, "fallback"),
-        ({"tuning": {"learning": LearningTuning()}}, "learning"),
-        ({"tuning": {"observer": ObserverTuning(adapts=("tip_mass",))}}, "observer that adapts"),
-        ({"start_velocity": (0.1, 0.0)}, "start that moves, at [m/s]"),
-    ],
-)
-def test_what_c_does_not_have_is_said_by_name(changes, part):
-    scene = load_scene(SCENES / "lemniscate.toml")
-    whole = {key: replace(getattr(scene, key), **value) if isinstance(value, dict) else value
-             for key, value in changes.items()}  # fmt: skip
-    scene = replace(scene, **whole)
-    with pytest.raises(GenerationError, match="C has no") as error:
-        check_scope(scene, scene.tuning)
-    assert error.value.part == part
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "controllers").glob("*.toml")), ids=lambda path: path.stem)
-def test_every_shipped_tuning_is_generated_or_refused_by_name(path):
-    scene = load_scene(SCENES / "lemniscate.toml")
-    tuning, part = load_tuning(path), REFUSED.get(path.stem)
-    if part is None:
-        assert check_scope(scene.tuned(tuning), tuning) is tuning
-        return
-    with pytest.raises(GenerationError) as error:
-        check_scope(scene.tuned(tuning), tuning)
-    assert error.value.part == part
-
-
-def test_files_of_others_are_left_alone(tmp_path, capsys):
-    (tmp_path / "README.md").write_text("mine")
-    assert main(["generate", str(SCENES / "lemniscate.toml"), "--out", str(tmp_path)]) == 1
-    assert "README.md" in capsys.readouterr().err
-    assert (tmp_path / "README.md").read_text() == "mine"
-
-
-def test_a_folder_has_one_solver(tmp_path, capsys):
-    """Their sources would be compiled together."""
-    (tmp_path / "osqp").mkdir()
-    assert main(["generate", str(SCENES / "lemniscate.toml"), "--solver", "daqp", "--out", str(tmp_path)]) == 1
-    assert "was generated with osqp" in capsys.readouterr().err
-    assert not (tmp_path / "pcr.h").exists()

@@ -4,20 +4,22 @@ import json
 import re
 import shutil
 import subprocess
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pcr_mpc.cli import main
+from pcr_mpc.codegen.folder import write_folder
 from pcr_mpc.codegen.library import GeneratedController, build
 from pcr_mpc.codegen.loss import measure_loss
 from pcr_mpc.codegen.precision import in_single
 from pcr_mpc.codegen.subject import Subject
+from pcr_mpc.codegen.vectors import recorded
 from pcr_mpc.errors import GenerationError
 from pcr_mpc.loop.controller.make_controller import make_controller
 from pcr_mpc.loop.scene.file import load_scene
-from tests.codegen.test_codegen import CC, INCLUDED, QUICK, needs_compiler
+from tests.codegen.conftest import CC, INCLUDED, QUICK, needs_compiler
 from tests.conftest import ROOT
 
 SCENES = ROOT / "models" / "scenes"
@@ -36,21 +38,6 @@ y = fmaxf(sinf(0.25f * x[0]), casadi_fmax(1.f, .5f)) + 0x1e5 + v1.e2; printf("%.
 
 
 def test_what_single_precision_cannot_do_is_said():
-    def subject(method, solver):
-        model = SimpleNamespace(method=SimpleNamespace(name=method))
-        return SimpleNamespace(
-            scene=SimpleNamespace(name="a scene"), tuning=SimpleNamespace(solver=solver), watched=model,
-            work=SimpleNamespace(foresight=SimpleNamespace(step_models=(model, model))),
-            plant=SimpleNamespace(step_model=model),
-        )  # fmt: skip
-
-    Subject.check_single(subject("closed_form", "osqp"))
-    with pytest.raises(GenerationError, match="closed form only") as error:
-        Subject.check_single(subject("multiple_shooting", "osqp"))
-    assert error.value.part == "float32"
-    with pytest.raises(GenerationError, match="take --solver osqp"):
-        Subject.check_single(subject("closed_form", "daqp"))
-
     def example(*said, status=0):
         def write(folder):
             lines = ["#!/bin/sh", *(f"echo '{line}'" for line in said), f"exit {status}"]
@@ -69,6 +56,21 @@ def test_what_single_precision_cannot_do_is_said():
         measure_loss("a scene", runs, 0.1, 0.5)
     loss = measure_loss("a scene", runs, 4.0, 0.5)
     assert (loss.others, loss.apart) == (3, 1e-5)
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_daqp_and_rods_that_are_shot_do_with_single_precision():
+    scene = replace(load_scene(SCENES / "limited.toml"), duration=1.5)
+    scene = replace(scene, plant=replace(scene.plant, method="multiple_shooting"))
+    model = replace(scene.tuning.model, method="multiple_shooting")
+    subject = Subject.of_scene(scene, replace(scene.tuning, solver="daqp", model=model), single=True)
+    run = recorded(subject)
+    loss = measure_loss(scene.name, lambda place: write_folder(subject, run, place), run.summary()["rms_mm"], 0.5)
+    assert sum(run.active_limits.values()) > 10
+    assert loss.others == 0
+    assert 1e-6 < loss.same < 0.01  # doubles would not differ
+    assert loss.rms_mm == pytest.approx(loss.double_rms_mm, abs=1e-3)
 
 
 @needs_compiler

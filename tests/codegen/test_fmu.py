@@ -14,7 +14,6 @@ import pytest
 
 from pcr_mpc.cli import main
 from pcr_mpc.codegen.fmu.archive import write_fmu
-from pcr_mpc.codegen.fmu.description import model_description, unit_exponents
 from pcr_mpc.codegen.fmu.variables import PARTS, layout
 from pcr_mpc.codegen.subject import Subject
 from pcr_mpc.codegen.tables import parameters
@@ -23,24 +22,17 @@ from pcr_mpc.files import require_free
 from pcr_mpc.loop.controller.make_controller import make_controller
 from pcr_mpc.loop.scene.file import load_scene
 from pcr_mpc.plant.motion.plant import Plant
-from tests.conftest import ROOT
+from tests.codegen.conftest import CC, QUICK, SCENES, needs_compiler
 
 fmpy = pytest.importorskip("fmpy")
 validation = pytest.importorskip("fmpy.validation")
 
-CC = os.environ.get("CC") or "gcc"
-needs_compiler = pytest.mark.skipif(
-    not (shutil.which(CC) and shutil.which("make")), reason="units are compiled here: needs gcc and make"
-)
-QUICK = (f"CC={CC}", "CFLAGS=-O0", "GRAPH_CFLAGS=-O0")
-MEASURED = ["p_x", "p_y", "v_x", "v_y", "q[0]", "q[1]"]
-RATES = ["u[0]", "u[1]"]
-PERIOD = 0.01
+from tests.codegen.unit import MEASURED, PERIOD, RATES, Unit  # noqa: E402  (it needs fmpy)
 
 
 @pytest.fixture(scope="module")
 def subject():
-    return Subject.of_scene(load_scene(ROOT / "models" / "scenes" / "lemniscate.toml"))
+    return Subject.of_scene(load_scene(SCENES / "lemniscate.toml"))
 
 
 @pytest.fixture(scope="module")
@@ -51,69 +43,8 @@ def files(subject, tmp_path_factory):
     for part in PARTS:
         for version in (2, 3):
             made[part, version] = folder / f"{part}{version}.fmu"
-            write_fmu(subject, part, version, made[part, version], *QUICK)
+            write_fmu(subject, part, version, made[part, version], f"CC={CC}", *QUICK)
     return made
-
-
-class Unit:
-    """One instance; what it logs is in ``said``."""
-
-    def __init__(self, path, folder, start=0.0, values=None):
-        about = fmpy.read_model_description(str(path))
-        self.two, self.said = about.fmiVersion == "2.0", []
-        self.at = {variable.name: variable.valueReference for variable in about.modelVariables}
-        kind = fmpy.fmi2.FMU2Slave if self.two else fmpy.fmi3.FMU3Slave
-        self.slave = kind(modelIdentifier=about.coSimulation.modelIdentifier, unzipDirectory=str(folder),
-                          instanceName="one", guid=about.guid or about.instantiationToken)  # fmt: skip
-        if self.two:
-            self._log = fmpy.fmi2.fmi2CallbackLoggerTYPE(self._hear)
-            calls = fmpy.fmi2.fmi2CallbackFunctions()
-            calls.logger = self._log
-            calls.allocateMemory = fmpy.fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
-            calls.freeMemory = fmpy.fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free)
-            self.slave.instantiate(callbacks=calls)
-            self.slave.setupExperiment(startTime=start)
-            self.set(values or {})
-            self.slave.enterInitializationMode()
-        else:
-            self.slave.instantiate(logMessage=lambda _, status, kind, text: self.said.append(text.decode()))
-            self.set(values or {})
-            self.slave.enterInitializationMode(startTime=start)
-        self.slave.exitInitializationMode()
-
-    def _hear(self, _, name, status, kind, text):
-        self.said.append(text.decode())
-
-    def state(self, what, *words):
-        """Call get, set, free, serialize or deserialize."""
-        name = f"{what}FMU{'state' if self.two else 'State'}"
-        return getattr(self.slave, name.replace("des", "deS") if self.two else name)(*words)
-
-    def get(self, names):
-        at = [self.at[name] for name in names]
-        return np.array(self.slave.getReal(at) if self.two else self.slave.getFloat64(at))
-
-    def whole(self, name):
-        at = [self.at[name]]
-        return (self.slave.getInteger(at) if self.two else self.slave.getInt32(at))[0]
-
-    def set(self, values):
-        at, values = [self.at[name] for name in values], [float(value) for value in values.values()]
-        if values:
-            self.slave.setReal(at, values) if self.two else self.slave.setFloat64(at, values)
-
-    def step(self, time, step):
-        return self.slave.doStep(currentCommunicationPoint=time, communicationStepSize=step)
-
-    def decide(self, k, x):
-        self.set({name: value for name, value in zip(MEASURED, x, strict=True) if name in self.at})
-        self.step(k * PERIOD, PERIOD)
-        return self.get(RATES)
-
-    def move(self, k, u):
-        self.set(dict(zip(RATES, u, strict=True)))
-        self.step(k * PERIOD, PERIOD)
-        return self.get(MEASURED)
 
 
 @pytest.fixture
@@ -130,34 +61,6 @@ def units(files, tmp_path):
             return unit
 
         yield made
-
-
-@pytest.mark.parametrize("version", [2, 3])
-@pytest.mark.parametrize("part", PARTS)
-def test_descriptions_are_valid(part, version, subject, tmp_path):
-    about = model_description(layout(subject, part), version, name="some scene", token="{0}", times=(6.0, 0.01),
-                              sources=["pcr_fmu.c"])  # fmt: skip
-    (tmp_path / "modelDescription.xml").write_bytes(about)
-    assert validation.validate_fmu(str(tmp_path)) == []
-    read = fmpy.read_model_description(str(tmp_path))
-    known = {variable.name: variable for variable in read.modelVariables}
-    assert float(known["rods[0].bending_stiffness"].start) == subject.scene.robot.rods[0].bending_stiffness
-    assert known["tip_mass"].variability == "tunable"
-    if part == "controller":  # which has many variables, each of which takes its time
-        return
-    (tmp_path / "modelDescription.xml").write_bytes(about.replace(b'unit="m/s"', b'unit="knots"'))
-    assert "knots" in str(validation.validate_fmu(str(tmp_path)))  # it would have been seen
-
-
-def test_units_are_made_of_base_units():
-    assert unit_exponents("N s/m") == {"kg": 1, "s": -1}
-    assert unit_exponents("N m^2") == {"kg": 1, "m": 3, "s": -2}
-    assert unit_exponents("1/rad^2") == {"rad": -2}
-
-
-def test_a_unit_has_a_suffix(tmp_path, capsys):
-    assert main(["fmu", "lemniscate", "--part", "plant", "--out", str(tmp_path / "plant.zip")]) == 1
-    assert "ends with .fmu" in capsys.readouterr().err
 
 
 @needs_compiler

@@ -13,7 +13,7 @@ from pcr_mpc.codegen.subject import Subject
 from pcr_mpc.codegen.tables import parameters
 from pcr_mpc.control.motor_limits import Limits
 from pcr_mpc.loop.scene.file import load_scene
-from tests.codegen.test_codegen import CC, SCENES, needs_compiler
+from tests.codegen.conftest import CC, SCENES, needs_compiler
 
 LEAST, MOST = 1e-30, 1e30
 NUMBERS = [-1.0, 0.0, 1e-31, LEAST, 0.002, 0.4, 9.0, 26.0, -26.0, MOST, 2e30, np.nan, np.inf, -np.inf]

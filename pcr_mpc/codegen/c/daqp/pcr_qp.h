@@ -2,6 +2,10 @@
 #ifndef PCR_QP_H
 #define PCR_QP_H
 
+#include "pcr_config.h"
+#if PCR_SINGLE
+#define DAQP_SINGLE_PRECISION
+#endif
 #include "types.h"
 
 #ifdef __cplusplus

@@ -5,6 +5,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
+#include "pcr_qp.h"
 #include "presolve.h"
 #include "utils.h"
 
