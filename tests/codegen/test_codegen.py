@@ -189,6 +189,17 @@ def test_parameters_that_change_while_it_runs_do_what_retune_does(lemniscate, tm
             ):
                 with pytest.raises(PCRError, match="refuses"):
                     in_c.set_parameters(parameters(subject) | {name: value})
+            measured, horizon = in_c._measured, scene.tuning.horizon
+            for name, size, wrong in (
+                ("window", 10 * horizon, (np.nan, np.inf)),
+                ("payloads", subject.work.foresight.places.count, (np.nan, np.inf, -5.0)),
+            ):
+                for place, value in ((0, wrong[0]), *((size - 1, each) for each in wrong)):
+                    given = np.zeros(size)
+                    given[place] = value
+                    setattr(measured, name, given.ctypes.data)
+                    assert in_c.raw_step(x) == 2, (name, place, value)
+                setattr(measured, name, None)
         if k == 40:
             in_python.retune(other)
             in_c.set_parameters(parameters(Subject.of_scene(scene, other)))

@@ -179,7 +179,8 @@ typedef struct {
 /* Get ready in a pose; NULL: where the scene starts. */
 pcr_result pcr_controller_init(pcr_controller *controller, const pcr_pose *pose);
 
-/* Decide for one control period. */
+/* Decide for one control period. A measurement may be anything: what is not believed is bridged. A window or payloads
+   that are not finite, or payloads that are negative, are refused with PCR_ARGUMENT, and nothing has changed. */
 pcr_result pcr_controller_step(pcr_controller *controller, const pcr_measurement *measured, pcr_output *output);
 
 /* Let other numbers take effect from the next step on: estimates, commands on the way and the last plan are kept. What

@@ -268,12 +268,24 @@ static void predict(const double *model, const double *x, const double *u, doubl
     memcpy(next, moved, sizeof moved);
 }
 
+/* Whether numbers that were handed in are finite and not less than that; none are. */
+static int sound(const double *values, int count, double least)
+{
+    for (int i = 0; values != NULL && i < count; i++) {
+        if (!(isfinite(values[i]) && values[i] >= least)) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
 pcr_result pcr_controller_step(pcr_controller *c, const pcr_measurement *measured, pcr_output *output)
 {
     if (c == NULL || !c->started) {
         return PCR_NOT_STARTED;
     }
-    if (measured == NULL || output == NULL) {
+    if (measured == NULL || output == NULL || !sound(measured->window, PCR_HORIZON * PCR_ROW, -INFINITY)
+        || !sound(measured->payloads, PCR_PLACES, 0.0)) {
         return PCR_ARGUMENT;
     }
     memset(output, 0, sizeof *output);
