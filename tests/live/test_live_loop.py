@@ -375,6 +375,23 @@ def test_what_is_asked_too_early_is_said(pair, tuning, scene):
         make_controller(pair, None)
     with pytest.raises(ValueError, match="a scene has a path, a period and a robot"):
         make_controller(scene, path=Hold((0, 0.25)))
+    with pytest.raises(ValueError, match=r"sensors is 0\.001, expected Sensors"):
+        make_controller(pair, None, tuning, sensors=0.001)
+
+
+@pytest.mark.parametrize("blend", [0.0, -1.0, float("nan"), float("inf"), "soon", True])
+def test_a_blend_takes_time(live, centre, blend):
+    Loop(live, centre).run(2)
+    with pytest.raises(ValueError, match="blend"):
+        live.follow(Hold((0.0, 0.26)), blend=blend)
+
+
+def test_one_coordinate_that_is_not_measured(live, centre):
+    loop = Loop(live, centre).run(20)
+    loop.call(tip=[None, 0.25], angles=loop.x[4:].tolist())
+    loop.wait()
+    loop.call(tip=None, angles=None)
+    assert set(loop.events) == {"measurement"}
 
 
 def test_where_nothing_is_to_be_tracked_the_motors_are_held():

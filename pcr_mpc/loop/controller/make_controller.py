@@ -52,6 +52,8 @@ def make_controller(
     ValueError
         The arguments fit neither a scene nor a robot.
     """
+    if sensors is not None and not isinstance(sensors, Sensors):
+        raise ValueError(f"sensors is {sensors!r}, expected Sensors(tip_noise=..., ...)")
     if isinstance(scene, Robot):
         if isinstance(tuning, Tuning) and not isinstance(robot, Tuning):
             tuning, robot = None, tuning

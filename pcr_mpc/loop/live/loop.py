@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...control.qp.program import Reference
-from ...errors import PCRError, checked_vector, measured_vector
+from ...errors import PCRError, checked_number, checked_vector, measured_vector
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.held_tip import solve_statics
@@ -151,6 +151,8 @@ class LiveLoop:
     def follow(self, path: Any, fading: float | None) -> None:
         """See `TrackingController.follow`."""
         trajectory, next_one = as_trajectory(path), self.k + 1
+        if fading is not None:
+            checked_number("blend", fading, above=0.0)
         self.notes += self.reference.follow(trajectory, self._now(), next_one, fading)
         self._wish = Wish(path=trajectory, start=next_one)
 
@@ -208,13 +210,7 @@ class LiveLoop:
         return self._last
 
     def _reading(self, tip: Any, angles: Any) -> tuple[np.ndarray, np.ndarray]:
-        n = self._asked.robot.n_rods
-        p = np.full(2, np.nan) if tip is None else measured_vector("tip", tip, 2)
-        if angles is None:
-            return p, np.full(n, np.nan)
-        if isinstance(angles, list | tuple):
-            angles = [np.nan if angle is None else angle for angle in angles]
-        return p, measured_vector("angles", angles, n)
+        return _measured("tip", tip, 2), _measured("angles", angles, self._asked.robot.n_rods)
 
     def _missed(self, count: int) -> list[Event]:
         said = f"{count} period{'s' if count > 1 else ''} passed without a call"
@@ -339,6 +335,15 @@ class LiveLoop:
 
 def _told(k: int, notes: list[Event]) -> tuple[dict[str, str], ...]:
     return tuple({"kind": kind, "message": f"period {k}: {message}"} for kind, message in notes)
+
+
+def _measured(name: str, value: Any, size: int) -> np.ndarray:
+    """A vector that was measured; NaN where it was not, which None says too, of all or of one entry."""
+    if value is None:
+        return np.full(size, np.nan)
+    if isinstance(value, list | tuple):
+        value = [np.nan if entry is None else entry for entry in value]
+    return measured_vector(name, value, size)
 
 
 def _number(name: str, value: Any) -> float:

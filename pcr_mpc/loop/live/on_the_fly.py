@@ -92,6 +92,8 @@ class OnTheFly(ABC):
         ------
         UnreachableError, UnstableError, ConvergenceError
             The path, or every way to it, leads where the robot cannot be; what was tracked goes on.
+        ValueError
+            ``path`` is none, or ``blend`` no time above zero.
         """
         self._on_the_fly().follow(path, blend)
 
