@@ -10,15 +10,17 @@ from ..control.tuning import SOLVERS
 from ..errors import GenerationError
 from ..files import require_free, results, write_text
 from ..loop.run.run import Run
+from .config import config
 from .loss import Loss
 from .precision import in_single
-from .readme import readme
+from .readme import TEXT, readme
 from .solver import licence, sources
 from .subject import Subject
-from .tables import config, tables
+from .tables import tables
 from .vectors import vectors
 
 _RUNTIME = Path(__file__).parent / "c"
+_ROOMS = (".", "controller", "plant", "project")
 _OSQP = {"osqp/src": "src", "osqp/public": "inc/public", "osqp/private": "inc/private"}
 _DAQP = ("src", "include", "unit")
 
@@ -89,7 +91,8 @@ def _files(folder: Path, solver: str) -> list[Path]:
 
 def _copies(folder: Path, solver: str) -> dict[Path, Path]:
     """Files that are copied as they are, and where from."""
-    own = [path for path in sorted(_RUNTIME.iterdir()) if path.is_file() and path.name != "readme.md"]
+    # Rooms are for who reads the package: who compiles a folder has one place.
+    own = [path for room in _ROOMS for path in sorted((_RUNTIME / room).iterdir()) if path.is_file() and path != TEXT]
     found = {folder / path.name: path for path in (*own, *sorted((_RUNTIME / solver).glob("*.[ch]")))}
     if solver == "daqp":
         sources_of = {f"daqp/{name}": sorted((_RUNTIME / "daqp" / name).glob("*.[ch]")) for name in _DAQP}

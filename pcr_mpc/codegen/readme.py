@@ -19,7 +19,7 @@ _LICENCES = {
 }
 # Folders in which a compiler finds the headers of a solver.
 HEADERS = {"osqp": ("osqp/public", "osqp/private"), "daqp": ("daqp/include",)}
-_TEXT = Path(__file__).parent / "c" / "readme.md"
+TEXT = Path(__file__).parent / "c" / "project" / "readme.md"
 
 
 def readme(subject: Subject, run: Run, loss: Loss | None = None) -> str:
@@ -52,7 +52,7 @@ def readme(subject: Subject, run: Run, loss: Loss | None = None) -> str:
         "versions": f"casadi {version('casadi')}, {tuning.solver} {version(tuning.solver)}, "
         f"Python {platform.python_version()}",
     }
-    text = _TEXT.read_text(encoding="utf-8")
+    text = TEXT.read_text(encoding="utf-8")
     for name, value in values.items():
         text = text.replace("{{" + name + "}}", value)
     return text

@@ -55,14 +55,22 @@ typedef struct {
     int width;               /* unknowns of a rod */
     double following;        /* residual that will do */
 } pcr_rods;
+pcr_room pcr_room_of(pcr_controller *controller);
 extern const pcr_rods pcr_model_rods, pcr_target_rods, pcr_watch_rods;
 int pcr_follow(const pcr_rods *rods, const double *numbers, const double *p, const double *q, double derivatives,
-               double *record, double *result, pcr_room room);
+               double *record, double *result, const pcr_room *room);
 
 /* pcr_pose.c: limits of the pose ahead that are near. Returns 0 if the rods could follow to it. */
 int pcr_near(pcr_controller *controller, pcr_pose_limits *limits);
 
-/* pcr_law.c: the plan of the linear MPC, from what `out` of the graph holds; the ladder below it. */
+/* pcr_foreseen.c: evaluate what inputs lead to, where the problem, or models and x alone, lie in check_in; states of the
+   plan that stands in `inputs`; by how much predicted states exceed the limits of poses, or `angles` those of the
+   motors. */
+void pcr_check(pcr_controller *controller);
+void pcr_predict_states(pcr_controller *controller, const double *models, const double *x);
+double pcr_broken_by(const pcr_controller *controller, const pcr_pose_limits *limits, double angles);
+
+/* pcr_law.c: the plan of the linear MPC, from what `out` of the graph holds; pcr_ladder.c: what is below it. */
 void pcr_law_reset(pcr_controller *controller);
 void pcr_law_restore(pcr_controller *controller, const pcr_controller *saved);
 void pcr_decide(pcr_controller *controller, const pcr_pose_limits *limits, pcr_output *output);

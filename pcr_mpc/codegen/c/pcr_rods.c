@@ -19,9 +19,19 @@ const pcr_rods pcr_target_rods = {pcr_graph_target_follow, pcr_graph_target_fini
 const pcr_rods pcr_watch_rods = {pcr_graph_watch_follow, pcr_graph_watch_finish, PCR_WATCH_WIDTH,
                                  PCR_WATCH_FOLLOWING};
 
+pcr_room pcr_room_of(pcr_controller *c)
+{
+    pcr_room room;
+    room.arg = c->arg;
+    room.res = c->res;
+    room.iw = c->iw;
+    room.w = c->w;
+    return room;
+}
+
 /* Newton's method from the prediction; `hasty`: given up unless it is nearly there after the first graph. */
 static int climb(const pcr_rods *rods, const double *numbers, const double *p, const double *q, double derivatives,
-                 int hasty, double *record, double *result, pcr_room room)
+                 int hasty, double *record, double *result, const pcr_room *room)
 {
     double target[2 + PCR_N], start[PCR_LARGEST_RECORD], found[PCR_LARGEST_RECORD], verdict[5], of[PCR_RESULT];
     double changed = 0.0;
@@ -32,13 +42,13 @@ static int climb(const pcr_rods *rods, const double *numbers, const double *p, c
     memcpy(target + 2, q, PCR_N * sizeof *target);
     memcpy(start, record, size);
     for (int done = 0; done < most; done += done ? 1 : first) {
-        room.arg[0] = target;
-        room.arg[1] = start;
-        room.arg[2] = numbers;
-        room.res[0] = found;
-        room.res[1] = verdict;
-        room.res[2] = of;
-        (done || first == 1 ? rods->once : rods->twice)(room.arg, room.res, room.iw, room.w);
+        room->arg[0] = target;
+        room->arg[1] = start;
+        room->arg[2] = numbers;
+        room->res[0] = found;
+        room->res[1] = verdict;
+        room->res[2] = of;
+        (done || first == 1 ? rods->once : rods->twice)(room->arg, room->res, room->iw, room->w);
         changed += verdict[2];
         /* Written so that NaN is a failure. */
         if (!(changed <= BRANCH_CHANGE && verdict[3] == 0.0) || (hasty && !(verdict[0] <= PCR_ROUGH))) {
@@ -71,7 +81,7 @@ static double smallest_substep(const double *numbers, const double *pose, const 
 }
 
 int pcr_follow(const pcr_rods *rods, const double *numbers, const double *p, const double *q, double derivatives,
-               double *record, double *result, pcr_room room)
+               double *record, double *result, const pcr_room *room)
 {
     if (!climb(rods, numbers, p, q, derivatives, 1, record, result, room)
         || !climb(rods, numbers, p, q, derivatives, 0, record, result, room)) {

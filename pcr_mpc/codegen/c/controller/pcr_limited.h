@@ -49,6 +49,14 @@ typedef struct {
     double primal_residual, dual_residual;
 } pcr_limited_answer;
 
+#define PCR_MOTOR_ROWS (3 * PCR_INPUTS)
+
+/* pcr_stack.c: L from the upper triangle of P column by column, which is the lower one row by row; 0 if P is positive
+   definite. Then rows of rates, changes of rate and angles; those of poses, over dt, with their bounds. */
+int pcr_factorise(double factor[PCR_INPUTS][PCR_INPUTS], const double *p);
+void pcr_stack(pcr_limited *limited, const double *models, const double *x, double dt, const pcr_pose_limits *limits,
+               double *low, double *high);
+
 /* Forget everything. */
 void pcr_limited_reset(pcr_limited *limited, double penalty);
 

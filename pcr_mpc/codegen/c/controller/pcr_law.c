@@ -1,8 +1,7 @@
-/* The linear MPC from its QP on, and the ladder below it. */
+/* The linear MPC from its QP on. */
 #include <math.h>
 #include <string.h>
 
-#include "pcr_graphs.h"
 #include "pcr_parts.h"
 
 #define JUMP 1e3
@@ -42,29 +41,6 @@ void pcr_law_reset(pcr_controller *c)
     reset_solvers(c);
 }
 
-/* Evaluate what inputs lead to; the problem, or models and x alone, lie in check_in. */
-static void check(pcr_controller *c)
-{
-    static const int places[] = {PCR_CHECK_MODELS, PCR_CHECK_X, PCR_CHECK_P, PCR_CHECK_Q, PCR_CHECK_L, PCR_CHECK_U,
-                                 PCR_CHECK_BOUNDS, PCR_CHECK_DT, PCR_CHECK_CLEAR, PCR_CHECK_INPUTS, PCR_CHECK_Y};
-    for (int i = 0; i < (int)(sizeof places / sizeof *places); i++) {
-        c->arg[i] = c->check_in + places[i];
-    }
-    c->res[0] = c->check_out;
-    c->res[1] = c->check_out + (PCR_HORIZON + 1) * PCR_STATES;
-    pcr_graph_check(c->arg, c->res, c->iw, c->w);
-}
-
-/* States of the plan that stands in c->inputs. */
-static void predict_states(pcr_controller *c, const double *models, const double *x)
-{
-    memcpy(c->check_in + PCR_CHECK_MODELS, models, PCR_MODELS * PCR_MODEL * sizeof *models);
-    memcpy(c->check_in + PCR_CHECK_X, x, PCR_STATES * sizeof *x);
-    memcpy(c->check_in + PCR_CHECK_INPUTS, c->inputs, sizeof c->inputs);
-    check(c);
-    memcpy(c->states, c->check_out, sizeof c->states);
-}
-
 /* Whether the last solution is a start for a problem of these sizes; NaN continues nothing. */
 static int continues(const pcr_controller *c, double hessian, double gradient)
 {
@@ -95,22 +71,6 @@ static int active_of(const double *pulls, const int *bits, int count)
     return active;
 }
 
-/* By how much the predicted states exceed the limits of poses, or `angles` those of the motors. */
-static double broken_by(const pcr_controller *c, const pcr_pose_limits *limits, double angles)
-{
-    double broken = angles;
-    for (int k = 1; k <= PCR_HORIZON; k++) {
-        for (int i = 0; i < limits->count; i++) {
-            double value = 0.0;
-            for (int j = 0; j < PCR_STATES; j++) {
-                value += limits->c[i][j] * c->check_out[k * PCR_STATES + j];
-            }
-            broken = fmax(broken, fmax(limits->lower[i] - value, value - limits->upper[i]));
-        }
-    }
-    return broken;
-}
-
 /* The optimum without limits, if it keeps them all. Returns 1 if that is the answer. */
 static int solve_without_limits(pcr_controller *c, const pcr_pose_limits *limits, double *inputs, pcr_output *output)
 {
@@ -121,9 +81,9 @@ static int solve_without_limits(pcr_controller *c, const pcr_pose_limits *limits
     }
     memcpy(c->check_in + PCR_CHECK_INPUTS, c->out + PCR_OUT_FREE, PCR_INPUTS * sizeof *found);
     memset(c->check_in + PCR_CHECK_Y, 0, 2 * PCR_INPUTS * sizeof *found);
-    check(c);
+    pcr_check(c);
     if (!(found[5] > 0.0) || found[0] > 0.0 || found[2] > 0.0 || !(found[1] <= tolerance)
-        || broken_by(c, limits, found[2]) > 0.0) {
+        || pcr_broken_by(c, limits, found[2]) > 0.0) {
         return 0;
     }
     memcpy(inputs, c->out + PCR_OUT_FREE, PCR_INPUTS * sizeof *inputs);
@@ -207,14 +167,14 @@ static int solve_rates(pcr_controller *c, const pcr_pose_limits *limits, const d
     for (int i = 0; i < 2 * PCR_INPUTS; i++) {
         in[PCR_CHECK_Y + i] = c->rates.solution.y[i] / rate;
     }
-    check(c);
+    pcr_check(c);
     const double *found = c->check_out + (PCR_HORIZON + 1) * PCR_STATES;
     left = pcr_qp_judge(&c->rates, found[0] / rate, rate * found[1]);
     if (left) {
         output->solver = (pcr_qp_status)left;
         return 0;
     }
-    if (!(broken_by(c, limits, found[2]) <= PCR_TOLERANCE * rate * PCR_PERIOD)) {
+    if (!(pcr_broken_by(c, limits, found[2]) <= PCR_TOLERANCE * rate * PCR_PERIOD)) {
         return 0;
     }
     const double pulls[2] = {rate * found[3], rate * found[4]};
@@ -318,67 +278,10 @@ void pcr_decide(pcr_controller *c, const pcr_pose_limits *limits, pcr_output *ou
         pcr_kept(c, inputs, c->u, x + 4, NULL, first);
         if (!predicted || memcmp(first, inputs, sizeof first) != 0) {
             memcpy(c->inputs[0], first, sizeof first);
-            predict_states(c, out + PCR_OUT_MODELS, x);
+            pcr_predict_states(c, out + PCR_OUT_MODELS, x);
         }
     }
     memcpy(c->models, out + PCR_OUT_MODELS, sizeof c->models);
     c->has_plan = c->has_states = c->has_models = 1;
     c->age = 0;
-}
-
-/* Rates of the LQR about where the reference is now, one period before its first state. */
-static void lqr(const pcr_controller *c, const double *x, const double *wanted, const double *inputs, double *u)
-{
-    double away[PCR_STATES];
-    for (int i = 0; i < PCR_STATES; i++) {
-        double now = wanted[i];
-        now -= i < 2 ? PCR_PERIOD * wanted[2 + i] : i >= 4 ? PCR_PERIOD * inputs[i - 4] : 0.0;
-        away[i] = x[i] - now;
-    }
-    for (int i = 0; i < PCR_N; i++) {
-        u[i] = inputs[i];
-        for (int j = 0; j < PCR_STATES; j++) {
-            u[i] -= c->parameters.gain[i * PCR_STATES + j] * away[j];
-        }
-    }
-}
-
-void pcr_fall_back(pcr_controller *c, const double *x, const double *wanted, const double *window,
-                   pcr_output *output)
-{
-    int finite = 1;
-    double asked[PCR_N];
-    for (int i = 0; i < PCR_STATES; i++) {
-        finite = finite && isfinite(x[i]);
-    }
-    if (c->has_plan && c->age >= 0 && c->age < PCR_HORIZON - 1) {
-        output->rung = PCR_SHIFTED_PLAN;
-        memmove(c->inputs[0], c->inputs[PCR_HORIZON > 1 ? 1 : 0], (PCR_HORIZON - 1) * sizeof c->inputs[0]);
-    } else {
-        output->rung = finite ? PCR_LQR : PCR_HOLD;
-        memset(c->inputs, 0, sizeof c->inputs);
-        if (finite) {
-            lqr(c, x, wanted, window + PCR_STATES, c->inputs[0]);
-        }
-    }
-    memcpy(asked, c->inputs[0], sizeof asked);
-    pcr_kept(c, asked, c->u, x + 4, NULL, c->inputs[0]);
-    for (int k = output->rung == PCR_SHIFTED_PLAN ? PCR_HORIZON - 1 : 1; k > 0 && k < PCR_HORIZON; k++) {
-        pcr_slowed(c, c->inputs[k - 1], c->inputs[k]);
-    }
-    output->active = 0;
-    for (int i = 0; i < PCR_N; i++) {
-        if (c->inputs[0][i] != asked[i]) {
-            output->active = pcr_met(c, c->inputs[0], c->u);
-        }
-    }
-    memset(output->slack, 0, sizeof output->slack);
-    output->iterations = 0;
-    output->primal_residual = output->dual_residual = NAN;
-    c->age += c->age >= 0;
-    c->has_states = c->has_models = c->has_plan && c->has_models && finite;
-    if (c->has_states) {
-        predict_states(c, c->models, x);
-    }
-    c->has_plan = 1;
 }

@@ -10,6 +10,8 @@ extern "C" {
 
 /* Share of a strain limit from which it is watched: a controller looks a horizon ahead. */
 #define PCR_STRAIN_WATCHED 0.8
+#define PCR_MARGIN_WATCHED 0.25 /* of a rod's margin */
+#define PCR_LEAST_CRITICAL_LOAD 5.7659
 
 typedef struct {
     pcr_controller *controller;
@@ -31,6 +33,9 @@ double pcr_times_state(const pcr_watch *w, int at);
 
 /* Add derivatives by the pose of rod i [x/L, y/L, angle] to those by the state. */
 void pcr_by_state(const pcr_watch *w, int at, int i, const double *by_pose);
+
+/* pcr_margin.c: margin of each rod to its critical load. */
+void pcr_rod_margins(pcr_watch *w, int kind);
 
 /* pcr_strain.c: largest strain of each rod. */
 void pcr_strain(pcr_watch *w, int kind);

@@ -15,7 +15,7 @@ static int bring(pcr_plant *plant, const double *numbers, double *record)
     room.res = plant->res;
     room.iw = plant->iw;
     room.w = plant->w;
-    if (pcr_follow(&pcr_model_rods, numbers, plant->x, plant->x + 4, PCR_CLOSE, record, result, room)) {
+    if (pcr_follow(&pcr_model_rods, numbers, plant->x, plant->x + 4, PCR_CLOSE, record, result, &room)) {
         return 1;
     }
     memcpy(plant->memory, record, PCR_PLANT_START * sizeof *record);
