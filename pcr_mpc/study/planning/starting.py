@@ -14,14 +14,14 @@ from ...plant.statics.free_tip import inverse_statics
 from .meshing import points
 from .pace import cells_of, constant_pace, spline_of
 from .path import TipPath
-from .timing import Problem, Timing, evaluated
+from .timing import Problem, Timing, evaluated, on_stand
 
 _ROUGH_CELLS = 40
 STATICS = 40  # poses that are found one by one
 _REST = 1e4  # s: so slow that motion asks for nothing
 # Of the speed, with which the shares of some limits grow.
 _POWERS = {"change of rate": 3.0, "tip acceleration": 2.0, "tip jerk": 3.0, "motor rate": 2.0, "tip speed": 1.0}
-_TRIALS = 40
+_TRIALS, _ESTIMATES = 40, 20
 _AIM, _NEAR_ENOUGH = 0.8, 0.8  # of the limits; of the duration that is expected to use so much of them
 # Cells over which the speed is changed, by what at most; the largest share to begin with.
 _REACH, _LARGEST_CHANGE, _WORST_START, _SWEEPS = 3, 3.0, 1.2, 4
@@ -69,6 +69,7 @@ def started(problem: Problem, path: TipPath) -> Timing:
     still = evaluated(problem, constant_pace(_ROUGH_CELLS, max(_REST, 1e3 * seconds)), x, q)
     _require_rest(still, path)
     found: Timing | None = None
+    seconds = _estimated(still, seconds)
     resting = still.turned.q.value, still.turned.poses
     kept: Timing | None = None
     for _ in range(_TRIALS):
@@ -81,8 +82,7 @@ def started(problem: Problem, path: TipPath) -> Timing:
         if found is None:
             seconds *= 2.0
             continue
-        shares = dict(zip((use.limit for use in found.uses), found.shares.max(axis=1), strict=True))
-        ratio = max((shares[kind] / _AIM) ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares)
+        ratio = _slower(found)
         if found.worst <= 1.0:
             kept = found
             if ratio > _NEAR_ENOUGH:
@@ -95,6 +95,23 @@ def started(problem: Problem, path: TipPath) -> Timing:
         iterations=_TRIALS,
         last=seconds,
     )
+
+
+def _estimated(still: Timing, seconds: float) -> float:
+    """Time in which limits on motion would be used well, if the rods answered to it as they do at rest [s]."""
+    for _ in range(_ESTIMATES):
+        pace = constant_pace(cells_of(still.pace), seconds)
+        ratio = _slower(on_stand(still.problem, pace, still.x, still.turned.stand))
+        seconds *= ratio
+        if abs(ratio - 1.0) < 1.0 - _NEAR_ENOUGH:
+            break
+    return seconds
+
+
+def _slower(timing: Timing) -> float:
+    """How many times as long it would take to use what is aimed at of the limits on motion."""
+    shares = dict(zip((use.limit for use in timing.uses), timing.shares.max(axis=1), strict=True))
+    return float(max((shares[kind] / _AIM) ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares))
 
 
 def _resting(problem: Problem, path: TipPath, x: np.ndarray) -> np.ndarray:

@@ -109,6 +109,11 @@ def evaluated(
     return _timing(problem, pace, x, moved, stood(moved, problem.pose, q, near, tolerance))
 
 
+def on_stand(problem: Problem, pace: BSpline, x: np.ndarray, stand: Stand) -> Timing:
+    """Estimate a pace from rods that were solved for another one, by their derivatives there."""
+    return _timing(problem, pace, x, _moving(problem, pace, x, slopes=False), stand)
+
+
 def _moving(problem: Problem, pace: BSpline, x: np.ndarray, *, slopes: bool) -> Motion:
     values = np.stack([pace(x, nu=order) for order in range(ORDERS_OF_PACE)])
     return motion(values, problem.course(x), problem.carrier, slopes=slopes)
