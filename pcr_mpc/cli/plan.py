@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ..design.examination import moving_mass
+from ..design.moving_mass import moving_mass
 from ..errors import OutputError, PCRError, cause
 from ..files import require_free, saved, stamped, write_text
 from ..loop.scene.file import load_scene

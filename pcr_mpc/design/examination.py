@@ -12,12 +12,12 @@ import numpy as np
 from .. import interrupt
 from ..errors import ModelError, PCRError
 from ..loop.scene.scene import Scene
-from ..plant.motion.plant import Plant
 from ..plant.robot import Robot
 from ..plant.statics.equilibrium import Equilibrium
 from ..plant.statics.free_tip import inverse_statics
 from ..plant.statics.stability import assess_stability
 from .demands import demands
+from .moving_mass import moving_mass
 from .reach import Reach, explore, tips_within
 from .rehearsal import rehearse
 from .remarks import Remark, about_rods, about_start, about_steps, unidentifiable
@@ -181,19 +181,6 @@ def _rod_figures(robot: Robot, i: int) -> dict[str, Any]:
         "own_frequency_Hz": hertz,
         "strain_limit": rod.strain_limit if math.isfinite(rod.strain_limit) else None,
     }
-
-
-def moving_mass(eq: Equilibrium) -> tuple[np.ndarray, float]:
-    """Mass that moves with the tip, shape (2, 2) [kg], and the largest share of the rods in it."""
-    robot = eq.robot
-    tip = robot.tip_mass * np.eye(2)
-    if not any(rod.line_density for rod in robot.rods):
-        return tip, 0.0
-    plant = Plant(robot, inertia="condensed")
-    plant.reset(np.concatenate([eq.p, np.zeros(2), eq.q]), eq)
-    mass = plant.mass(eq.p, eq.q)[0][:2, :2]
-    largest = float(np.linalg.eigvalsh(mass)[-1])
-    return mass, 1.0 - robot.tip_mass / largest
 
 
 def _pose_figures(eq: Equilibrium, mass: np.ndarray, share: float) -> dict[str, Any]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from ...errors import ModelError
 
@@ -233,7 +232,9 @@ class Smooth:
         return np.stack([self._spline(u), first / np.sqrt(square), bend], axis=1)
 
     @cached_property
-    def _spline(self) -> CubicSpline:
+    def _spline(self) -> Any:
+        from scipy.interpolate import CubicSpline  # with half of SciPy, slow to import
+
         points = np.array(self.points + (self.points[:1] if self.closed else ()))
         roots = np.sqrt(np.hypot(*np.diff(points, axis=0).T))
         u = np.concatenate([[0.0], np.cumsum(roots)])

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import BPoly, BSpline, CubicSpline, splprep
 
 from ...errors import ModelError, check_numbers, checked_array
 from .curves import Points
@@ -111,6 +110,8 @@ class Tabulated:
     @cached_property
     def _splines(self) -> tuple[Any, Any, Any]:
         """Position, velocity and acceleration."""
+        from scipy.interpolate import BPoly, BSpline, CubicSpline, splprep  # with half of SciPy, slow to import
+
         t, points = np.array(self.times), np.array(self.points)
         if self.closed:
             points[-1] = points[0]

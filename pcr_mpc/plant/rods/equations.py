@@ -14,16 +14,11 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.integrate import DOP853
 
 from ...buffered import graph_cache
 from ...frozen import Frozen
 
-# Explicit Runge-Kutta schemes as (A, b); where a rod's properties change along s, c is the row sums of A.
-SCHEMES: dict[str, tuple[np.ndarray, np.ndarray]] = {
-    "rk4": (np.diag([0.5, 0.5, 1.0], -1), np.array([1.0, 2.0, 2.0, 1.0]) / 6.0),
-    "rk8": (np.asarray(DOP853.A), np.asarray(DOP853.B)),  # Dormand and Prince, order 8, 12 stages
-}
+SCHEMES = ("rk4", "rk8")  # explicit Runge-Kutta: the paper's, and that of Dormand and Prince of order 8 in 12 stages
 
 
 @dataclass(frozen=True)
@@ -166,7 +161,7 @@ def runge_kutta(
     physics: Any,
 ) -> Any:
     """Integrate ``slope(state, here)`` over h in equal steps from s, with the properties of `propagation`'s rod."""
-    a, b = SCHEMES[scheme]
+    a, b = _coefficients(scheme)
     step = h / steps
     for j in range(steps):
         along = _along(layout, physics, s + j * step, step, a.sum(axis=1)) if layout else [None] * len(b)
@@ -176,6 +171,15 @@ def runge_kutta(
             slopes.append(slope(state + step * increment, here))
         state = state + step * sum(w * k for w, k in zip(b, slopes, strict=True) if w)
     return state
+
+
+def _coefficients(scheme: str) -> tuple[np.ndarray, np.ndarray]:
+    """A and b; where a rod's properties change along s, c is the row sums of A."""
+    if scheme == "rk4":
+        return np.diag([0.5, 0.5, 1.0], -1), np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
+    from scipy.integrate import DOP853  # with half of SciPy, which takes a good part of a second to import
+
+    return np.asarray(DOP853.A), np.asarray(DOP853.B)
 
 
 def _along(layout: Layout, physics: Any, s: Any, step: Any, nodes: np.ndarray) -> list[_Here]:

@@ -149,6 +149,9 @@ class Equilibrium(Frozen):
 
         One letter a rod, L(eft) or R(ight): the default robot with its rods bowed outward is "LR".
         """
+        if self.record is not None and self.method == "closed_form":
+            hands = columns(self.record, self.robot.n_rods).unknowns[2]
+            return "".join("R" if hand > 0 else "L" for hand in hands.tolist())
         letters = []
         for nodes, physics in zip(self.nodes, self.physics, strict=True):
             _, _, theta, n_x, n_y, _ = sample_rod(nodes, 2, physics)[:, -1]

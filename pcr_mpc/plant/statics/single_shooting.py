@@ -7,7 +7,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import least_squares
 
 from ...buffered import BufferedFunction, graph_cache
 from ...errors import ConvergenceError
@@ -134,6 +133,8 @@ class SingleShooting:
         def jacobian(y: np.ndarray) -> np.ndarray:
             residual(y)
             return evaluate.outputs[1].copy()
+
+        from scipy.optimize import least_squares  # slow to import, and of no use to the other methods
 
         # An overflow on the way is a bad trial point, which the solver rejects; the verdict is below.
         with np.errstate(all="ignore"):

@@ -18,7 +18,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from ....buffered import BufferedFunction, per_thread
 from . import elastica
@@ -107,6 +106,8 @@ def stable_shapes(xi: float, eta: float) -> list[HeldShape]:
 
 def critical_load(log_tip_angle: float) -> float:
     """lambda_c, the load at which a rod with its tip held loses stability."""
+
+    from scipy.optimize import brentq  # which takes a good part of a second to import, and few need it
 
     def determinant(load: float) -> float:
         return _determinant(log_tip_angle, load)
