@@ -35,11 +35,14 @@ plt.rcParams.update(
 )
 
 
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a picture, whole or not at all, with metadata by which it is known to be ours; and close it."""
+def save_figure(figure: Any, path: Path, *, tight: bool = True) -> None:
+    """Write a picture, whole or not at all, with metadata by which it is known to be ours; and close it.
+
+    Without ``tight`` it is as large as its layout has it, which saves drawing it twice.
+    """
     path = Path(path)
     try:
         with replacing(path) as draft:
-            figure.savefig(draft, metadata=picture_metadata(path))
+            figure.savefig(draft, bbox_inches="tight" if tight else None, metadata=picture_metadata(path))
     finally:
         plt.close(figure)

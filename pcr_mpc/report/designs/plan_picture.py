@@ -64,7 +64,7 @@ def plot_plan(planned: TimedPath, path: Path) -> None:
     path_axes.margins(0.1)
     path_axes.locator_params(nbins=6)
     path_axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2)
-    save_figure(figure, path)
+    save_figure(figure, path, tight=False)
 
 
 def _coloured(axes: Any, x: np.ndarray, y: np.ndarray, planned: TimedPath) -> None:

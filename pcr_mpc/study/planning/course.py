@@ -20,9 +20,16 @@ class PacedPath:
 
     def __init__(self, path: TipPath, nominal: BSpline) -> None:
         self.path, self.nominal = path, nominal
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """P and its first four derivatives, shape (5, len(x), 2): the chain rule (Faa di Bruno)."""
+        """P and its first four derivatives, shape (5, len(x), 2), which a plan asks for again and again at its x."""
+        if self._last is None or self._last[0] is not x:
+            self._last = x, self._derivatives(x)
+        return self._last[1]
+
+    def _derivatives(self, x: np.ndarray) -> np.ndarray:
+        """By the chain rule (Faa di Bruno)."""
         s, s1, s2, s3, s4 = (self.nominal(x, nu=order)[:, None] for order in range(5))
         p, p1, p2, p3, p4 = self.path.derivatives(s[:, 0])
         return np.stack(

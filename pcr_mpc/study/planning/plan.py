@@ -22,7 +22,7 @@ from .path import TipPath, path_of
 from .rods_mass import asked_of_motors, with_rods
 from .starting import STATICS, evened, started, where
 from .timed_path import Paced, RodsMass, TimedPath
-from .timing import Problem, Timing
+from .timing import NEAR, Problem, Timing
 
 _CELL = 1e-2  # s
 _FEWEST, _MOST = 80, 240  # cells
@@ -32,7 +32,7 @@ _GAINS = (1e-2, 1e-3)  # of the duration, that are none: roughly, and in the end
 _ALLOWED = 1.0 - 5e-4  # share of the limits that is used, so that they are kept between the points too
 _EXCESS = 1e-4  # over 1, on the fine grid, at which no more points are added
 _LARGEST_EXCESS = 1e-3
-_ROUNDS = 12
+_ROUNDS = 14
 
 
 def plan_timing(
@@ -195,20 +195,23 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tupl
     """
     per_cell = FINE // 3  # which finds most
     between = points(cells_of(timing.pace), per_cell)
-    fine = timing.at(between)
+    fine, exact = timing.at(between, NEAR), False
     for _ in range(_ROUNDS):
-        if fine.worst <= 1.0 + _EXCESS and per_cell == FINE:
+        kept = fine.worst <= 1.0 + _EXCESS
+        if kept and exact:
             return timing, fine
-        if fine.worst <= 1.0 + _EXCESS:
-            per_cell = FINE
-            between = points(cells_of(timing.pace), per_cell)
-            fine = timing.at(between)
+        if kept:
+            if per_cell != FINE:
+                per_cell, between = FINE, points(cells_of(timing.pace), FINE)
+                fine = timing.at(between, NEAR)
+            else:
+                fine, exact = fine.at(between), True
             continue
         x = with_points(timing.x, fine.shares, between, _ALLOWED)
         more = faster(timing.at(x), most=_ITERATIONS[2], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
         if more.pace is timing.pace and len(x) == len(timing.x):
             break
-        timing, fine = more, more.at(between)
+        timing, fine, exact = more, more.at(between, NEAR), False
     if fine.worst > 1.0 + _LARGEST_EXCESS:
         limit, at = np.unravel_index(int(fine.shares.argmax()), fine.shares.shape)
         raise ConvergenceError(

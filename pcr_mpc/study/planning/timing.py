@@ -16,7 +16,7 @@ from .motion import ORDERS_OF_PACE, Carrier, Motion, motion
 from .pace import duration
 
 # Force of the rods that may be missing, in units of sum EI/L^2: on the way, and in the end.
-_NEAR, _EXACT = 1e-4, 1e-6
+NEAR, EXACT = 1e-4, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +75,10 @@ class Timing:
         """Largest share of any limit."""
         return float(self.shares.max())
 
-    def at(self, x: np.ndarray) -> Timing:
+    def at(self, x: np.ndarray, tolerance: float = EXACT) -> Timing:
         """Return the same at other points."""
         q = np.asarray(CubicSpline(self.x, self.turned.q.value)(x))
-        return evaluated(self.problem, self.pace, x, q, self.near(x), _EXACT)
+        return evaluated(self.problem, self.pace, x, q, self.near(x), tolerance)
 
     def with_slopes(self) -> Timing:
         """Return the same, and how it changes."""
@@ -96,7 +96,7 @@ def evaluated(
     x: np.ndarray,
     q: np.ndarray,
     near: Equilibria | None = None,
-    tolerance: float = _NEAR,
+    tolerance: float = NEAR,
 ) -> Timing:
     """Evaluate a pace at the points x, without slopes; errors, ``near`` and ``tolerance`` as `balanced`.
 
