@@ -15,7 +15,7 @@ from ..rods.follower import BRANCH_CHANGE
 from ..rods.method import RodMethod, warm_step
 from ..rods.numbers import Kind
 from ..rods.physics import robot_layout
-from .batch import solve_statics_batch
+from .batch import solve_from_records
 from .equilibria import Equilibria, together
 from .equilibrium import Equilibrium
 from .first_rung import ROUGH, Climbed, FirstRung
@@ -60,16 +60,17 @@ def inverse_statics_along(robot: Robot, p: Any, force: Any, guess: Equilibrium) 
     if robot.needs_shooting is not None:  # a graph of theirs saves nothing
         return _one_by_one(robot, p, force, guess)
     first = _alone(robot, p, force, 0, guess)
-    q, wanted = _walked(robot, p, force, first), force + robot.tip_weight
+    q, records = _walked(robot, p, force, first)
+    wanted = force + robot.tip_weight
     for _ in range(_POLISHES):
-        poses = solve_statics_batch(robot, p, q, guess=first, along=True)
+        poses = solve_from_records(robot, p, q, records)
         missed = wanted - poses.force
         held = poses.solved & poses.stable & _within_stops(robot, q)
         if not held.all():
             break
         if (np.linalg.norm(missed, axis=1) <= _EXACTLY * robot.force_scale).all():
             return poses
-        q = q + np.einsum("kij,kj->ki", np.linalg.pinv(poses.dforce_dq), missed)
+        q, records = q + np.einsum("kij,kj->ki", np.linalg.pinv(poses.dforce_dq), missed), poses.records
     return _one_by_one(robot, p, force, guess)
 
 
@@ -94,24 +95,27 @@ def _within_stops(robot: Robot, q: np.ndarray) -> np.ndarray:
     return np.asarray(((q >= low) & (q <= high)).all(axis=1))
 
 
-def _walked(robot: Robot, p: np.ndarray, force: np.ndarray, first: Equilibrium) -> np.ndarray:
-    """Motor angles at every pose, nearly, from the first on, shape (K, n) [rad]."""
-    wanted = force + robot.tip_weight
-    q, row, last = np.tile(first.q, (len(p), 1)), 1, first
+def _walked(robot: Robot, p: np.ndarray, force: np.ndarray, first: Equilibrium) -> tuple[np.ndarray, np.ndarray]:
+    """Motor angles at every pose, nearly, from the first on, shape (K, n) [rad], and records of poses close to them."""
+    assert first.record is not None
+    wanted, last = force + robot.tip_weight, first
+    q, records = np.tile(first.q, (len(p), 1)), np.tile(first.record, (len(p), 1))
+    row = 1
     while row < len(p):
-        count = min(_BLOCK, len(p) - row)
-        rows = slice(row, row + count)
-        done, last = _block(last, p[rows], wanted[rows], q[rows])
+        rows = slice(row, min(row + _BLOCK, len(p)))
+        done, last = _block(last, p[rows], wanted[rows], q[rows], records[rows])
         row += done
-        if done < count:
+        if row < rows.stop:
             last = _alone(robot, p, force, row, last)
-            q[row] = last.q
+            q[row], records[row] = last.q, last.record
             row += 1
-    return q
+    return q, records
 
 
-def _block(last: Equilibrium, p: np.ndarray, force: np.ndarray, q: np.ndarray) -> tuple[int, Equilibrium]:
-    """Turn the motors at a few poses more, and write their angles; how many followed, and the last of these."""
+def _block(
+    last: Equilibrium, p: np.ndarray, force: np.ndarray, q: np.ndarray, records: np.ndarray
+) -> tuple[int, Equilibrium]:
+    """Turn the motors at a few poses more, and write angles and records; how many followed, and the last of these."""
     interrupt.check()
     robot, count = last.robot, len(p)
     first, graph, numbers = _graph(robot)
@@ -132,8 +136,9 @@ def _block(last: Equilibrium, p: np.ndarray, force: np.ndarray, q: np.ndarray) -
     done = count if good.all() else int(np.argmin(good))
     if not done:
         return 0, last
-    q[:done], state = turned[:done], states[done - 1]
-    pose, record, carried = np.split(state, [2 + robot.n_rods, 2 + robot.n_rods + len(last.record)])
+    ends = [2 + robot.n_rods, 2 + robot.n_rods + records.shape[1]]
+    q[:done], records[:done] = turned[:done], states[:done, ends[0] : ends[1]]
+    pose, record, carried = np.split(states[done - 1], ends)
     return done, first.equilibrium(Climbed(pose, record, carried, float(residual[done - 1]), 0.0, 0))
 
 

@@ -93,6 +93,16 @@ def solve_statics_batch(
     return work.result()
 
 
+def solve_from_records(robot: Robot, p: np.ndarray, q: np.ndarray, records: np.ndarray) -> Equilibria:
+    """`solve_statics_batch` by the default method, each from the record of a pose nearby (`Equilibria.records`)."""
+    way = chosen_way(robot, None, 8, None, "rk8")
+    solver = solver_of(robot, way.method, way.shooting)
+    assert isinstance(solver, RodSolver)
+    work = _Work(robot, p, q, way, compiled=False)
+    work.from_records(solver, records)
+    return work.result()
+
+
 def _each_from_its_own(
     robot: Robot, p: np.ndarray, q: np.ndarray, guess: Equilibria, way: Way, compiled: bool
 ) -> Equilibria:
