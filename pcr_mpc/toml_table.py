@@ -266,8 +266,24 @@ def read_toml(path: str | Path) -> Table:
     return Table(path, "", data)
 
 
+def near_file(path: Path) -> Path | None:
+    """File that somebody may have meant by a path where there is none: its name or its folder is misspelt."""
+    folder = path.parent
+    if folder.is_dir():
+        names = [one.name for one in folder.glob("*.toml")]
+        near = difflib.get_close_matches(path.name if path.suffix else f"{path.name}.toml", names, n=1)
+        return folder / near[0] if near else None
+    if not folder.parent.is_dir():
+        return None
+    folders = [one.name for one in folder.parent.iterdir() if (one / path.name).is_file()]
+    near = difflib.get_close_matches(folder.name, folders, n=1)
+    return folder.parent / near[0] / path.name if near else None
+
+
 def _at_hand(path: Path) -> str:
-    """Advice to whom a file is missing that comes with the package, and may be meant."""
+    """Advice to whom a file is missing that is misspelt, or comes with the package."""
+    if near := near_file(path):
+        return f"; did you mean {near}?"
     if not (kinds := kinds_of(path.stem)):
         return ""
     kind = kinds[0] if len(kinds) == 1 else " and a ".join(kinds)

@@ -13,6 +13,7 @@ import warnings
 from .. import interrupt
 from ..files import leaving_no_empty_folders
 from .parser import ABOVE_ZERO, ENDINGS, LEAST, parser
+from .places import remember
 
 # Arguments that name a file: a path, or the name of one of these kinds that comes with the package.
 _FILES = {
@@ -46,8 +47,11 @@ def _run(options: argparse.Namespace, given: list[str]) -> int:
         with interrupt.nothing_to_lose():
             module, name = options.run
             command = getattr(importlib.import_module(f"{__package__}.{module}"), name)
-        with leaving_no_empty_folders():
-            status: int = command(options)
+        try:
+            with leaving_no_empty_folders():
+                status: int = command(options)
+        finally:
+            remember(options)
         sys.stdout.flush()
         if not status:  # else the command has said what there is to say
             interrupt.check()

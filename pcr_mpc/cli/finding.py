@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..catalogue import is_name, kinds_of, nearest, shipped
-from ..toml_table import Table, read_toml
+from ..toml_table import Table, near_file, read_toml
 
 # What only files of a kind have, by which one is known that is given in the place of another.
 _MARKS = {"robot": ("rods",), "scene": ("robot", "control"), "tuning": ("weights", "horizon", "pd", "law")}
@@ -29,6 +29,11 @@ def found(given: str, kinds: tuple[str, ...], command: str) -> tuple[Path, bool]
     if is_name(given) and not path.is_file():
         if own:
             raise _error(f"{given} is a {own[0]}, and {command} takes {_of(kinds)}; pcr-mpc models lists them", given)
+        if near := near_file(path):
+            names = next(filter(None, (nearest(given, one) for one in kinds)), None)
+            hint = f" (did you mean {names!r}?)" if names else ""
+            raise _error(f"no {kinds[0]} named {given!r} comes with the package{hint}, and there is no such file; did "
+                         f"you mean {near}?", given)  # fmt: skip
         return shipped(given, next((one for one in kinds if nearest(given, one)), kinds[0])), True
     table = read_toml(path)
     is_kind = next((one for one, marks in _MARKS.items() if any(table.peek(mark) is not None for mark in marks)), None)

@@ -25,6 +25,7 @@ from ..study.excitation.file import PATH, SCENE, require_readable, write_path, w
 from ..study.identification.identify import identify
 from ..study.identification.logs.log import Log, read_log
 from ..study.identification.robot_file import robot_path, write_robot
+from .places import own_place
 
 _FILES = ("identification.json", "identification.png")
 _EXCITED = (PATH, SCENE, "excitation.json", "excitation.png")
@@ -37,7 +38,7 @@ def identify_robot(options: argparse.Namespace) -> int:
     free = [name for names in options.free or ["default"] for name in names.split(",") if name.strip()]
     logs = _logs(options.logs, scene.robot.n_rods)
     others = _logs(options.validate, scene.robot.n_rods)
-    folder = options.results or Path("results") / "identify" / scene.name
+    folder = options.results or own_place(options, f"identify/{scene.name}", "--results takes another folder")
     require_folder(folder, _FILES, force=options.overwrite)
     if options.out:
         require_free(options.out, force=options.overwrite)
@@ -84,7 +85,7 @@ def identify_robot(options: argparse.Namespace) -> int:
 def excite_robot(options: argparse.Namespace) -> int:
     """Run `pcr-mpc excite`."""
     scene, known = load_scene(options.scene), load_uncertainty(robot_path(options.scene))
-    folder = options.out or Path("results") / "excite" / scene.name
+    folder = options.out or own_place(options, f"excite/{scene.name}")
     require_folder(folder, _EXCITED, force=options.overwrite)
     found = excite(scene, options.duration, trials=options.trials, seed=options.seed, uncertainty=known, progress=True)
     interrupt.check()

@@ -12,6 +12,7 @@ from ..files import require_folder, results, saved
 from ..loop.scene.file import load_scene
 from ..report.studies.margins import margins_table, plot_margins
 from ..study.margins.side_by_side import compare_margins
+from .places import own_place
 
 
 def margins(options: argparse.Namespace) -> int:
@@ -19,7 +20,7 @@ def margins(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     tuning = load_tuning(options.controller) if options.controller else None
     used = tuning or scene.tuning
-    out = options.out or Path("results") / "margins" / f"{scene.name}_{used.name if used else 'none'}"
+    out = options.out or own_place(options, f"margins/{scene.name}_{used.name if used else 'none'}")
     names = ["margins.json"] if options.no_pictures else ["margins.json", "margins.png"]
     require_folder(out, names, force=options.overwrite)
     predicted, summary = compare_margins(

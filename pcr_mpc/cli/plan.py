@@ -21,12 +21,13 @@ from ..study.planning.limits import PlanLimits
 from ..study.planning.plan import plan_timing, rods_left_out
 from ..study.planning.timed_path import TimedPath
 from ..toml_table import seen_from
+from .places import own_place
 
 
 def plan(options: argparse.Namespace) -> int:
     """Run `pcr-mpc plan`."""
     scene = load_scene(options.scene)
-    out = options.out or Path("results") / "plan" / f"{scene.name}.csv"
+    out = options.out or own_place(options, f"plan/{scene.name}.csv")
     picture = None if options.no_pictures else out.with_suffix(".png")
     for path in (out, picture):
         if path is not None:

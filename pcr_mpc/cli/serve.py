@@ -14,6 +14,7 @@ from ..errors import OutputError
 from ..files import results, saved
 from ..loop.scene.file import load_scene
 from ..loop.scene.scene import Scene
+from .places import own_place
 
 
 def _scene(options: argparse.Namespace) -> Scene:
@@ -69,7 +70,7 @@ def hil(options: argparse.Namespace) -> int:
     scene = _scene(options)
     if options.duration is not None:
         scene = replace(scene, duration=options.duration)
-    folder = options.out or Path("results") / "hil" / scene.name
+    folder = options.out or own_place(options, f"hil/{scene.name}")
     found = run_hil(scene, generated=options.generated, progress=True)
 
     def write(where: Path) -> None:

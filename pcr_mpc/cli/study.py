@@ -32,8 +32,10 @@ from ..study.timing.timing import time_scene
 from ..study.tuning.file import default_path, to_tune, write_tuning
 from ..study.tuning.space import Search
 from ..study.tuning.study import finished_trials, tune
+from .places import own_place
 
 _TIMING = ("timing.json", "timing.png")
+_STEPS, _QUICK_STEPS = 100_000, 2_000
 _TRIALS = ("trials.csv", "trade_off.png")
 
 
@@ -60,9 +62,11 @@ def choose_rung(options: argparse.Namespace) -> int:
 def time_loop(options: argparse.Namespace) -> int:
     """Run `pcr-mpc timing`."""
     scene = load_scene(options.scene)
-    folder = options.out or Path("results") / "timing" / scene.name
+    folder = options.out or own_place(options, f"timing/{scene.name}")
     require_folder(folder, _TIMING, force=options.overwrite)
-    result = time_scene(scene, options.steps, progress=True, in_c=time_in_c)
+    steps = options.steps or (_QUICK_STEPS if options.quick else _STEPS)
+    without_c = options.quick or options.no_c
+    result = time_scene(scene, steps, progress=True, in_c=None if without_c else time_in_c)
 
     def write(where: Path) -> None:
         with results(where) as staged:
@@ -78,7 +82,7 @@ def time_loop(options: argparse.Namespace) -> int:
 def tune_controller(options: argparse.Namespace) -> int:
     """Run `pcr-mpc tune`."""
     scene, known = to_tune(options.scene, options.start)
-    folder = Path("results") / "tune" / scene.name
+    folder = own_place(options, f"tune/{scene.name}", "give one of them another name")
     # What comes with the package is left as it came.
     path = options.out or Path(f"{scene.name}.toml")
     if options.out is None and "scene" not in options.named:

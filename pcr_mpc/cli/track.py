@@ -32,6 +32,7 @@ from ..report.tables import summary_table
 from ..study.margins.predicted import predict_delay_margin
 from ..view.replay import write_replay
 from .options.command import LINKS
+from .places import own_place
 
 _MARGIN_POSES = 5  # a quarter of a second
 _PICTURES, _LEARNT = ("track.png", "track.gif", "replay.html"), ("laps.png",)
@@ -58,13 +59,11 @@ def track(options: argparse.Namespace) -> int:
         if options.plant
         else scene.make_plant()
     )
-    folder = options.out or Path("results") / scene.name
+    folder = options.out or own_place(options, scene.name)
     # Rather now than after the run.
     used: Tuning | None = None if own else tuning or scene.tuning
     drawn = () if options.no_pictures else _pictures(used)
     require_folder(folder, (*RECORD, *drawn), force=options.overwrite)
-    if options.out is None:
-        _say_replaced(folder, options.scene)
     failure: SimulationError | None = None
     try:
         run = simulate(scene, plant, controller, options.seed, progress=True)
@@ -87,20 +86,6 @@ def track(options: argparse.Namespace) -> int:
     if problem or second:
         raise OutputError(problem or second, path=str(folder))
     return 0
-
-
-def _say_replaced(folder: Path, scene: Path) -> None:
-    """Say before a run that it takes the place of one of another scene of the same name."""
-    try:
-        earlier = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["scene_file"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return
-    if Path(earlier).resolve() != Path(scene).resolve():
-        print(
-            f"pcr-mpc: warning: the run of {earlier} that is in {folder} will be replaced, as the scenes have the same "
-            "name; --out takes another folder",
-            file=sys.stderr,
-        )
 
 
 def _delay_margin(scene: Scene, tuning: Tuning, reference: InverseDynamics | None) -> dict[str, Any] | None:

@@ -9,7 +9,6 @@ import os
 import sys
 import threading
 import webbrowser
-from pathlib import Path
 
 from .. import interrupt
 from ..control.tuning import Tuning, load_tuning
@@ -20,6 +19,7 @@ from ..loop.scene.file import load_scene
 from ..view.live.session import Session
 from ..view.replay import write_replay
 from ..view.server import ViewServer
+from .places import own_place
 
 
 def view(options: argparse.Namespace) -> int:
@@ -30,7 +30,7 @@ def view(options: argparse.Namespace) -> int:
         own = OwnController(options.controller)
     elif options.controller:
         own = load_tuning(options.controller)
-    folder = options.out or Path("results") / "view" / scene.name
+    folder = options.out or own_place(options, f"view/{scene.name}")
     server = ViewServer(
         lambda: Session(scene, own, options.seed), (options.host, options.port), folder, anywhere=options.anywhere
     )

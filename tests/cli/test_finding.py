@@ -1,12 +1,15 @@
 """What a command is given in the place of what it takes is named, with what may be meant."""
 
+import os
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
 
 from pcr_mpc import shipped
 from pcr_mpc.cli import main
-from pcr_mpc.cli.track import _say_replaced
+from pcr_mpc.cli.places import own_place, remember
+from pcr_mpc.errors import ModelError
 
 
 @pytest.fixture
@@ -59,7 +62,51 @@ def test_a_name_is_that_of_the_package_though_a_folder_is_called_so(mine, tmp_pa
 
 def test_a_run_of_another_scene_of_the_same_name_is_not_replaced_without_a_word(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "summary.json").write_text('{"scene_file": "a/scene.toml"}')
-    for scene, said in (("b/scene.toml", True), ("a/scene.toml", False), (str(tmp_path / "a/scene.toml"), False)):
-        _say_replaced(tmp_path, Path(scene))
-        assert ("the run of a/scene.toml" in capsys.readouterr().err) == said
+    for scene, said in (
+        ("a/scene.toml", False), ("b/scene.toml", True), ("b/scene.toml", False),
+        (str(tmp_path / "b/scene.toml"), False), ("a/scene.toml", True),
+    ):  # fmt: skip
+        options = Namespace(scene=Path(scene))
+        where = own_place(options, "plan/mine.csv")
+        assert ("will be replaced" in capsys.readouterr().err) == said
+        where.parent.mkdir(parents=True, exist_ok=True)
+        where.write_text(scene)
+        remember(options)
+    # A command that failed has replaced nothing.
+    os.utime(where, (0, 0))
+    options = Namespace(scene=Path("c/scene.toml"))
+    own_place(options, "plan/mine.csv")
+    assert "the results of a/scene.toml" in capsys.readouterr().err
+    remember(options)
+    own_place(Namespace(scene=Path("a/scene.toml")), "plan/mine.csv")
+    assert not capsys.readouterr().err
+
+
+def test_commands_say_whose_results_they_replace(mine, tmp_path, monkeypatch, capsys):
+    """Every command that has a place of its own for a scene's results."""
+    monkeypatch.chdir(tmp_path)
+    asked = []
+    places = {"plan": "plan", "track": "track", "margins": "margins", "study": "timing", "identify": "excite"}
+    for module, command in places.items():
+
+        def noted(options, place, other="", command=command):
+            asked.append(command)
+            raise ModelError("far enough", said=True)
+
+        monkeypatch.setattr(f"pcr_mpc.cli.{module}.own_place", noted)
+        more = ["--duration", "2"] if command == "excite" else []
+        assert main([command, str(mine / "scene.toml"), *more]) == 1
+    assert asked == list(places.values())
+
+
+@pytest.mark.parametrize("command", ["track", "plan", "check", "margins"])
+def test_a_misspelt_file_is_guessed(command, mine, capsys):
+    for given in (mine / "scen.toml", mine / "scene", mine.with_name("mines") / "scene.toml"):
+        assert main([command, str(given)]) == 1
+        assert f"no such file; did you mean {mine / 'scene.toml'}?" in capsys.readouterr().err
+
+
+def test_a_misspelt_name_may_be_a_file(mine, monkeypatch, capsys):
+    monkeypatch.chdir(mine)
+    assert main(["track", "scen"]) == 1
+    assert "did you mean scene.toml?" in capsys.readouterr().err

@@ -33,9 +33,12 @@ def add(command: Command) -> None:
         "Time plant steps of every method and the control step against their budgets; draw it.",
     )
     timing.add_argument("scene", help="scene: a file, or a name of pcr-mpc models")
-    timing.add_argument("--steps", type=int, default=100_000,
+    timing.add_argument("--steps", type=int,
                         help="plant steps and control steps (default 100000: two or three minutes); whatever the "
                         "number, C is compiled besides: a minute")  # fmt: skip
+    timing.add_argument("--no-c", action="store_true", help="leave out the steps in C, which must be compiled")
+    timing.add_argument("--quick", action="store_true",
+                        help="a first look: 2000 steps and no C, in a few seconds")  # fmt: skip
     timing.add_argument("--out", type=Path, help="folder for the results (default results/timing/NAME)")
 
     margins = command(

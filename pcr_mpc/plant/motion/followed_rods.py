@@ -90,8 +90,6 @@ class FollowedRods:
         self._forget()
         if guess is None:
             self.solver.start(p, q)
-        elif isinstance(self.solver, RodSolver):
-            self.solver.begin(guess)
         else:
             self.solver.start(guess.p, guess.q, guess.nodes)
         self.go(p, q, None)
