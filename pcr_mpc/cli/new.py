@@ -13,13 +13,14 @@ from pathlib import Path
 from ..design.examination import Examination, examine
 from ..design.remarks import Remark, about_wish
 from ..design.sizing import Design, design
+from ..design.strips import stiffer_upright
 from ..design.toml_text import files
 from ..design.wish import Wish
 from ..errors import InfeasibleError, ModelError, PCRError
 from ..files import require_absent, require_free, write_text
 from ..loop.demand.feasibility import check_scene
 from ..loop.scene.file import load_scene
-from ..plant.robot import load_robot
+from ..plant.robot import Robot, load_robot
 from ..report.designs.check_tables import check_record, check_table
 from ..report.designs.new_table import new_record, new_table
 from ..toml_table import read_toml
@@ -88,7 +89,10 @@ def check(options: argparse.Namespace) -> int:
     if options.picture:
         require_free(options.picture, force=options.overwrite)
     is_robot = read_toml(options.target).has("rods")
-    found = examine(load_robot(options.target) if is_robot else load_scene(options.target))
+    what = load_robot(options.target) if is_robot else load_scene(options.target)
+    robot_file = options.target if is_robot else options.target.parent / read_toml(options.target).text("robot")
+    upright = stiffer_upright(what if isinstance(what, Robot) else what.robot, robot_file)
+    found = examine(what, upright=upright)
     found.remarks = [_with_file(one, options) for one in found.remarks]
     print(json.dumps(check_record(found)) if options.json else check_table(found))
     if options.picture:

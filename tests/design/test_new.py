@@ -16,6 +16,7 @@ from pcr_mpc.cli import main
 from pcr_mpc.design.examination import examine
 from pcr_mpc.design.motors import MOTORS, motor_named
 from pcr_mpc.design.sizing import design
+from pcr_mpc.design.strips import stiffer_upright
 from pcr_mpc.design.toml_text import files
 from pcr_mpc.design.wish import Wish
 from pcr_mpc.plant.materials import MATERIALS
@@ -85,6 +86,8 @@ def test_strips_of_spring_steel(tmp_path, capsys):
     # Rods of 31.6 g; they are 900 times as stiff out of the plane, where the tip of 0.1 kg sags by less than 1 mm.
     assert "3.2 times what its rods weigh, as was wished; 6 times" in remarks["tip mass"]
     assert "support" not in remarks
+    assert main(["check", str(folder / "robot.toml"), "--json"]) == 0
+    assert "support" not in {one["about"] for one in json.loads(capsys.readouterr().out)["remarks"]}
     robot = load_robot(folder / "robot.toml")
     assert robot.stiffnesses == pytest.approx([206e9 * 12e-3 * 0.4e-3**3 / 12] * 2)
     assert [rod.line_density for rod in robot.rods] == pytest.approx([7850 * 12e-3 * 0.4e-3] * 2)
@@ -269,3 +272,20 @@ def test_robots_of_all_sizes_check_and_track(numbers, tmp_path):
     assert found.errors == []
     assert max(row["used"] for row in found.figures["reference"]["peaks"].values()) < 1
     assert tracked(tmp_path, laps=0.35) < 1e-4
+
+
+def test_sections_say_how_stiff_rods_are_out_of_the_plane(tmp_path):
+    """A strip 4 mm wide and 1 mm thick beside a round rod of the same EI: (16 + 1) / 2."""
+    steel = "youngs_modulus = 206e9\ndensity = 7850.0\n"
+    strip = f"{steel}width = 4e-3\nthickness = 1e-3\n"
+    wire = f"{steel}diameter = {(64 * 4e-3 * 1e-9 / 12 / math.pi) ** 0.25!r}\n"
+    stated = "bending_stiffness = 0.05\nline_density = 0.01\n"
+    file = tmp_path / "robot.toml"
+    for sections, ratio in (((strip, wire), 8.5), ((strip, strip), 16.0), ((strip, stated), None)):
+        rods = "".join(
+            f"[[rods]]\nbase = [{x}, 0.0]\nlength = 0.5\nangle_limits = [-3.0, 3.0]\n{own}"
+            for x, own in zip((-0.1, 0.1), sections, strict=True)
+        )
+        file.write_text(f'name = "pair"\n[motors]\nrate_limit = 6.0\nacceleration_limit = 300.0\ntorque_limit = 1.5\n'
+                        f"[tip]\nmass = 0.2\ndrag = 0.1\n{rods}")  # fmt: skip
+        assert stiffer_upright(load_robot(file), file) == (ratio if ratio is None else pytest.approx(ratio))
