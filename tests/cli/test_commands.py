@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -93,3 +95,14 @@ def test_a_period_that_is_kept_is_not_searched(tmp_path):
     search = tuning_space.Search(scene, Spread(), 2, 0, f"sqlite:///{tmp_path / 'study.db'}")
     assert "period" in tuning_space.parameters(search, scene.tuning)
     assert "period" not in tuning_space.parameters(replace(search, keep_period=True), scene.tuning)
+
+
+def test_commands_start_without_what_they_have_no_use_for():
+    """SciPy's optimisers, integrators and splines take a third of a second to import, which plans alone need."""
+    slow = '[m for m in ("scipy.optimize", "scipy.integrate", "scipy.interpolate", "scipy.stats") if m in sys.modules]'
+    program = (
+        f"import sys; import pcr_mpc.cli.statics, pcr_mpc.cli.serve, pcr_mpc.cli.new, pcr_mpc.cli.track; print({slow});"
+        f'import pcr_mpc.cli.plan; print("scipy.integrate" in sys.modules)'
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[:2] == ["[]", "False"]
