@@ -283,6 +283,22 @@ def test_what_cannot_be_had_is_refused_while_the_old_goes_on(live, centre, scene
     assert loop.error(scene.trajectory, 100) < 0.02
 
 
+def test_a_joystick_that_is_held_against_an_edge(live, centre):
+    """Told in every period; it brakes before the reach of the rods, says so once, and comes back when it is told to."""
+    loop = Loop(live, centre)
+    for _ in range(140):
+        live.jog((0.0, 0.15))
+        loop.run(1)
+    assert loop.events == ["refused"]
+    assert 0.35 < loop.x[1] < 0.387
+    assert np.abs(loop.x[2:4]).max() < 0.01  # it is told again and again to come nearer
+    live.jog((0.0, -0.1))
+    loop.run(30)
+    assert loop.x[3] == pytest.approx(-0.1, abs=2e-3)
+    live.hold()
+    assert loop.run(40).events == ["refused"]
+
+
 def test_jogging_into_a_stop_ends_before_it(live, centre):
     loop = Loop(live, centre).run(1)
     live.jog((0.25, 0.1))

@@ -25,6 +25,7 @@ _LEAP = 1000  # periods at once over which no motion is followed
 _STRIDE = 5  # rows from which to which the rods are followed along a reference that was solved before
 _OF_JERK = 0.4  # share of the motors' change of rate that a pursuit's jerk asks for
 _ACCELERATION, _JERK = 0.5, 0.31  # greatest ones of a pursuit, over speed times quickness, and times its square
+_QUIET = 10  # periods after which it is said again that a target cannot go on
 _FRESH = 0.8  # weight of the newest velocity of a point that moves
 
 Event = tuple[str, str]
@@ -41,7 +42,7 @@ class LiveReference(Rows):
     def start(self, pose: Equilibrium, k: int) -> None:
         """Stand in a pose in period k, which may be under load: the motors are then where no load would have them."""
         self.first, self._motion = k, self._still(pose.p, k)
-        self._point = None
+        self._point, self._blocked_in = None, None
         row = self._at(pose)
         state = np.zeros((1, 3, 2))
         state[0, 0] = pose.p
@@ -110,9 +111,14 @@ class LiveReference(Rows):
                     self._remake(motion, k)
                 except PCRError:
                     continue
-                return [("refused", f"the target cannot go on: {error}; it brakes, and stays there")]
+                return self._blocked(k, f"the target cannot go on: {error}; it brakes, and stays there")
         self._freeze()
-        return [("refused", f"the target cannot go on: {error}; it stays where it can be")]
+        return self._blocked(k, f"the target cannot go on: {error}; it stays where it can be")
+
+    def _blocked(self, k: int, why: str) -> list[Event]:
+        """Say why the target does not go on; who jogs on against an edge hears it once."""
+        before, self._blocked_in = self._blocked_in, k
+        return [] if before is not None and 0 <= k - before <= _QUIET else [("refused", why)]
 
     def follow(self, path: Trajectory, k: int, start: int, fading: float | None) -> list[Event]:
         """Join a path, whose time begins in period ``start``, from period k on, in ``fading`` seconds if that is said.
@@ -173,17 +179,24 @@ class LiveReference(Rows):
     def hold(self, k: int) -> list[Event]:
         """Come to rest where the target is in period k."""
         self._point = None
-        self._remake(self._pursuit(k, self._samples[k - self.first, 0], np.zeros(2)), k)
-        return []
+        return self._pursued(self._pursuit(k, self._samples[k - self.first, 0], np.zeros(2)), k)
 
     def jog(self, velocity: np.ndarray, k: int) -> list[Event]:
         """Move on at a velocity [m/s], until told otherwise or as far as can be."""
         self._point = None
         motion = self._pursuit(k, None, velocity)
-        self._remake(motion, k)
-        if math.hypot(*velocity) <= motion.speed:
-            return []
+        notes = self._pursued(motion, k)
+        if math.hypot(*velocity) <= motion.speed or self._motion is not motion:
+            return notes
         return [("warning", f"jogs at {motion.speed:.3g} m/s: the motors do not turn for {math.hypot(*velocity):.3g}")]
+
+    def _pursued(self, motion: Pursuit, k: int) -> list[Event]:
+        """Move so from period k on; brake where that cannot be had."""
+        try:
+            self._remake(motion, k)
+        except PCRError as error:
+            return [*self._blocked(k, f"the target cannot go there: {error}; it brakes, and stays"), *self.stop(k)]
+        return []
 
     def pursue(self, point: Any, k: int) -> list[Event]:
         """Go to a point [m], or after it if it moves from call to call; what cannot be had is refused, and told."""

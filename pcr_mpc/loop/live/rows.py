@@ -86,6 +86,7 @@ class Rows:
         self._motion: Motion = self._still((0.0, 0.0), 0)
         self._point: tuple[int, np.ndarray, np.ndarray] | None = None
         self._refused = ""  # the point that was refused last
+        self._blocked_in: int | None = None  # the period in which the target could not go on, last
 
     def state(self, k: int) -> np.ndarray:
         """Target in period k: position [m], velocity, acceleration, shape (3, 2)."""
