@@ -128,7 +128,7 @@ def test_a_scene_that_cannot_run_as_asked_fails(capsys):
 
 def test_what_the_table_has_said_at_length_is_not_said_twice(monkeypatch, capsys):
     found = Examination("limited", None, load_scene(shipped("limited")), remarks=[Remark("error", "reference", "why")])
-    monkeypatch.setattr("pcr_mpc.cli.new.examine", lambda _: found)
+    monkeypatch.setattr("pcr_mpc.cli.new.examine", lambda _, upright: found)
     monkeypatch.setattr("pcr_mpc.cli.new.check_table", lambda one: one.remarks[0].text)
     assert main(["check", "limited"]) == 1
     captured = capsys.readouterr()
