@@ -30,6 +30,7 @@ from pcr_mpc import (
 )
 from pcr_mpc.cli import main
 from pcr_mpc.linearisation.pose_limits import PoseLimits
+from pcr_mpc.loop.demand.feasibility import reference_demand, reference_of
 from pcr_mpc.loop.references.tabulated import Tabulated
 from pcr_mpc.loop.references.trajectory import PickAndPlace, smooth_step
 from pcr_mpc.report.designs.plan_table import plan_table
@@ -269,7 +270,7 @@ def driven(scene, planned, step=1e-4):
     return np.array(tips), t
 
 
-def test_a_free_path_is_what_the_plant_does_under_its_motors(scene):
+def test_a_free_path_is_what_the_plant_does_under_its_motors(scene, tmp_path):
     """Between two points: faster than on the given way, by motors whose rates and their changes are within limits."""
     free = plan_timing(scene, cells=40, free=True)
     tips, t = driven(scene, free)
@@ -282,6 +283,16 @@ def test_a_free_path_is_what_the_plant_does_under_its_motors(scene):
     assert np.abs(np.diff(free.rates, axis=0) / np.diff(free.t)[:, None]).max() < scene.robot.acceleration_limit
     assert np.abs(rates).max() < scene.robot.rate_limit
     assert np.abs(free.rates[[0, -1]]).max() < 1e-6
+    # Of the file that is written nothing but the tip is read: by inverse statics it asks for no more.
+    (tmp_path / "free.csv").write_text(free.csv())
+    path = load_path(tmp_path / "free.csv")
+    for period in (5e-4, 5e-3):
+        duration = period * math.ceil(path.duration / period)
+        plant = replace(scene.plant, dt=period)
+        case = replace(scene, trajectory=path, duration=duration, period=period, plant=plant)
+        asked = reference_demand(case, reference_of(case, case.start()))
+        for kind in ("rate_rad_s", "rate_change_rad_s2"):
+            assert asked[kind]["asked"] <= asked[kind]["limit"], (period, kind)
 
 
 @pytest.mark.slow

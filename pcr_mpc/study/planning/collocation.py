@@ -171,11 +171,6 @@ def _weights(part: float, order: int) -> np.ndarray:
     return np.asarray(np.linalg.solve(np.vander(NODES, increasing=True).T, powers))
 
 
-def slopes_at(parts: np.ndarray) -> np.ndarray:
-    """Weights of the Gauss points in the derivative at parts of an interval, (len(parts), s)."""
-    return np.stack([_weights(float(part), 1) for part in parts])
-
-
 def _force(problem: Problem) -> float:
     """A unit of forces [N]."""
     return max(_ACCELERATION * problem.carrier.mass, 1e-2 * problem.pose.robot.force_scale)

@@ -12,15 +12,14 @@ from ...errors import ConvergenceError, ModelError
 from ...loop.references.blended import Blended
 from ...loop.references.trajectory import PickAndPlace, Trajectory
 from ...plant.rods.physics import require_plain
-from ...plant.statics.equilibria import Equilibria
 from ...plant.statics.symbolic import rod_unknowns
-from .angles import followed
-from .collocation import NODES, Collocated, slopes_at, solved
+from .angles import angles, followed, stood
+from .collocation import NODES, Collocated, solved
 from .limits import Asked, Use, uses
-from .linear import Linear
+from .motion import motion
 from .pace import times
 from .timed_path import Move
-from .timing import Problem, Timing
+from .timing import EXACT, Problem, Timing, asked_of
 
 _MOST_POINTS = 100  # more are samples of a path, and no way-points
 _FEWEST = 4  # intervals from one way-point to the next
@@ -32,13 +31,15 @@ _BY_BOUNDS = {"motor rate", "change of rate", "motor angle", "tip region"}  # ke
 
 @dataclass(frozen=True, eq=False)
 class Hermite(Move):
-    """Quintics through position, velocity and acceleration at the ends of intervals.
+    """Polynomials of degree 7 through position, velocity, acceleration and jerk at the ends of intervals.
+
+    The motors' rates follow from the jerk: where it is continuous, they are.
 
     Attributes
     ----------
     t : ndarray, shape (K + 1,)
         [s].
-    samples : ndarray, shape (K + 1, 3, 2)
+    samples : ndarray, shape (K + 1, 4, 2)
     """
 
     t: np.ndarray
@@ -51,8 +52,12 @@ class Hermite(Move):
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """See `Move`."""
+        return np.moveaxis(self.derivatives(t)[:3], 0, 1)
+
+    def derivatives(self, t: np.ndarray) -> np.ndarray:
+        """Position and its first four derivatives, shape (5, len(t), 2)."""
         spline = BPoly.from_derivatives(self.t, self.samples)
-        return np.stack([spline(t), spline.derivative(1)(t), spline.derivative(2)(t)], axis=1)
+        return np.stack([spline(t), *(spline.derivative(order)(t) for order in range(1, 5))])
 
     def breaks(self) -> np.ndarray:
         """See `Move`."""
@@ -109,13 +114,13 @@ def freed(timing: Timing, points: np.ndarray, intervals: int, allowed: float) ->
     problem = timing.problem
     require_plain(problem.pose.robot, "a free path (free)")
     hands, rods = rod_unknowns(problem.pose.robot, problem.pose)
-    motion = _started(timing, points, intervals, rods)
+    moved = _started(timing, points, intervals, rods)
     # Most limits are far: those that turn out not to be are added.
     kinds = frozenset(use.limit for use in timing.uses if use.largest.max() > _NEAR) - _BY_BOUNDS
     attempts = 0
     while True:
-        motion, attempts = solved(motion, problem, hands, points, allowed, kinds), attempts + 1
-        found = _checked(motion, problem)
+        moved, attempts = solved(moved, problem, hands, points, allowed, kinds), attempts + 1
+        found = _checked(moved, problem)
         beyond = {use.limit for use in found.uses if use.largest.max() > 1.0 + _LARGEST_EXCESS}
         if not beyond:
             return found
@@ -131,7 +136,7 @@ def freed(timing: Timing, points: np.ndarray, intervals: int, allowed: float) ->
                 f"points where it was kept; take more cells than {intervals}",
                 residual=excess,
                 iterations=found.iterations,
-                last=motion.states,
+                last=moved.states,
             )
         kinds |= new
 
@@ -160,47 +165,39 @@ def _started(timing: Timing, points: np.ndarray, intervals: int, rods: Callable[
     return Collocated(x, changes, inside[:, -2:].reshape(*shape, 2), unknowns.reshape(*shape, 2 * n), spans, counts)
 
 
-def _checked(motion: Collocated, problem: Problem) -> Freed:
-    """What a motion asks for, by statics at every point of a dense grid."""
-    robot, carrier, steps = problem.pose.robot, problem.carrier, motion.steps
+def _checked(moved: Collocated, problem: Problem) -> Freed:
+    """What the written path of the tip asks for, by statics at every point of a dense grid.
+
+    The motors' motion is that by which the rods carry the path's forces, not that of the program: what is between its
+    points differs.
+    """
+    robot, carrier, pose, steps = problem.pose.robot, problem.carrier, problem.pose, moved.steps
     n = robot.n_rods
     ends = np.concatenate([[0.0], np.cumsum(steps)])
-    q, u = motion.states[:, 4 : 4 + n], motion.states[:, 4 + n :]
+    p, v, q, u = np.split(moved.states, [2, 4, 4 + n], axis=1)
+    poses = followed(pose, p, q, None)
+    if not poses.solved.all():
+        lost = int(np.argmin(poses.solved))
+        raise ConvergenceError(
+            f"the rods could not be followed along the planned path at p = {p[lost]} m: {poses.reason[lost]}",
+            residual=float("nan"),
+            iterations=moved.iterations,
+            last=q[lost],
+        )
+    a = (carrier.weight - poses.force - robot.drag * v) / carrier.mass
+    turned = np.einsum("mij,mj->mi", poses.dforce_dp, v) + np.einsum("mij,mj->mi", poses.dforce_dq, u)
+    move = Hermite(ends, np.stack([p, v, a, -(turned + robot.drag * a) / carrier.mass], axis=1))
 
-    def forces(tips: np.ndarray, angles: np.ndarray) -> Equilibria:
-        poses = followed(problem.pose, tips, angles, None)
-        if not poses.solved.all():
-            row = int(np.argmin(poses.solved))
-            raise ConvergenceError(
-                f"the rods could not be followed along the planned path at p = {tips[row]} m: {poses.reason[row]}",
-                residual=float("nan"),
-                iterations=motion.iterations,
-                last=angles[row],
-            )
-        return poses
-
-    force = forces(motion.states[:, :2], q).force
-    acceleration = (carrier.weight - force - robot.drag * motion.states[:, 2:4]) / carrier.mass
-    move = Hermite(ends, np.stack([motion.states[:, :2], motion.states[:, 2:4], acceleration], axis=1))
-
-    share = np.arange(FINE) / FINE
+    part = np.append(np.tile(np.arange(FINE) / FINE, len(steps)), 1.0)
     row = np.append(np.repeat(np.arange(len(steps)), FINE), len(steps) - 1)
-    part = np.append(np.tile(share, len(steps)), 1.0)
     since = part * steps[row]
     t = ends[row] + since
-    angles = q[row] + since[:, None] * u[row] + since[:, None] ** 2 / 2 * motion.changes[row]
-    rates = u[row] + since[:, None] * motion.changes[row]
-    samples = move(t)
-    poses = forces(samples[:, 0], angles)
-    jerk = np.einsum("ms,msd->md", slopes_at(part), motion.accelerations[row]) / steps[row][:, None]
-    acceleration = (carrier.weight - poses.force - robot.drag * samples[:, 1]) / carrier.mass
-    velocity, a, j, turned, rate, change, torque = (
-        Linear(value, np.empty((*value.shape, 0)))
-        for value in (samples[:, 1], acceleration, jerk, angles, rates, motion.changes[row], poses.motor_torque)
-    )
-    asked = Asked(samples[:, 0], velocity, a, j, turned, rate, change, torque, poses, problem.pose)
+    guess = q[row] + since[:, None] * u[row] + since[:, None] ** 2 / 2 * moved.changes[row]
+    # In time: at a pace of 1.
+    course = motion(np.repeat([[1.0], [0.0], [0.0], [0.0]], len(t), axis=1), move.derivatives(t), carrier, slopes=False)
+    asked = asked_of(course, angles(course, stood(course, pose, guess, None, EXACT), t))
     grid = len(steps) * len(NODES) + 1
-    return Freed(move, t, asked, uses(problem.limits, asked), grid, motion.iterations)
+    return Freed(move, t, asked, uses(problem.limits, asked), grid, moved.iterations)
 
 
 def _first_valley(away: np.ndarray) -> int:

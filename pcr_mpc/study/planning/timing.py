@@ -121,7 +121,12 @@ def _moving(problem: Problem, pace: BSpline, x: np.ndarray, *, slopes: bool) -> 
 
 def _timing(problem: Problem, pace: BSpline, x: np.ndarray, moved: Motion, stand: Stand) -> Timing:
     turned = angles(moved, stand, x)
-    asked = Asked(
+    return Timing(problem, pace, x, moved, turned, uses(problem.limits, asked_of(moved, turned)))
+
+
+def asked_of(moved: Motion, turned: Angles) -> Asked:
+    """What a motion asks for of tip, motors and rods."""
+    return Asked(
         moved.path[0],
         moved.velocity,
         moved.acceleration,
@@ -130,7 +135,6 @@ def _timing(problem: Problem, pace: BSpline, x: np.ndarray, moved: Motion, stand
         turned.rate,
         turned.acceleration,
         turned.torque,
-        stand.poses,
-        stand.pose,
+        turned.poses,
+        turned.stand.pose,
     )
-    return Timing(problem, pace, x, moved, turned, uses(problem.limits, asked))
