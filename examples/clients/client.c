@@ -51,7 +51,9 @@ int main(int count, char **words)
         uint32_t sum = crc32(out, MEASUREMENT - 4), sequence;
         memcpy(out + MEASUREMENT - 4, &sum, 4);
         send(wire, out, sizeof out, 0);
-        if (recv(wire, in, sizeof in, 0) == COMMAND && (sum = crc32(in, COMMAND - 4), !memcmp(&sum, in + COMMAND - 4, 4))
+        long size; /* what comes late is of an older measurement */
+        do { size = recv(wire, in, sizeof in, 0); } while (size == COMMAND && (memcpy(&sequence, in + 8, 4), sequence < k));
+        if (size == COMMAND && (sum = crc32(in, COMMAND - 4), !memcmp(&sum, in + COMMAND - 4, 4))
             && !memcmp(in, "PCR\1\1\0\2", 7) && in[7] == N && (memcpy(&sequence, in + 8, 4), sequence == k)) {
             memcpy(u, in + HEAD + 4, sizeof u);
             printf("%u rung %d rates %g %g\n", (unsigned)k, in[HEAD], u[0], u[1]);

@@ -38,10 +38,12 @@ def main(host, port, periods=10):
         began = time.monotonic()
         for k in range(int(periods)):
             wire.send(measurement(k, time.monotonic() - began, p, q))
+            found = None
             try:
-                found = command(wire.recv(512))
+                while not found or found[0] < k:  # what comes late is of an older measurement
+                    found = command(wire.recv(512))
             except OSError:
-                found = None  # no answer in time: keep the last rates for a few periods, then stop by yourself
+                pass  # no answer in time: keep the last rates for a few periods, then stop by yourself
             if found and found[0] == k:
                 print(k, "rung", found[1], "rates", *found[2])
                 q = [angle + PERIOD * rate for angle, rate in zip(q, found[2], strict=True)]

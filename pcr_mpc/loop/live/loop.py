@@ -24,8 +24,9 @@ from .motions import as_trajectory
 from .reference import Event, LiveReference
 from .rows import Asked
 
-# Periods without a call that are reckoned; after more, whatever is expected is worth nothing.
-PAUSE = 10
+# Without a call for so many periods, and so many seconds, they are reckoned; after more, whatever is expected is worth
+# nothing.
+_PAUSE, _PAUSE_TIME = 10, 0.1
 # Complete readings in a row, agreeing with each other, after which the robot is believed to be there again.
 _RETURNED = 3
 
@@ -101,6 +102,7 @@ class LiveLoop:
         self._clock = Clock(asked.period)
         self.reference = LiveReference(asked)
         self._bridge = math.inf if sensors.bridge == math.inf else round(sensors.bridge / asked.period)
+        self._pause = max(_PAUSE, round(_PAUSE_TIME / asked.period))
         self._near = 0.05 * float(asked.robot.lengths.min()) + 10.0 * sensors.tip_noise
         self.k = -1  # the last period that was decided on
         self._wish = Wish()
@@ -214,7 +216,7 @@ class LiveLoop:
 
     def _missed(self, count: int) -> list[Event]:
         said = f"{count} period{'s' if count > 1 else ''} passed without a call"
-        if count > PAUSE:
+        if count > self._pause:
             self._lose()
             return [("pause", f"{said}: the estimates begin anew when the robot is seen; the motors brake until then")]
         self._core.pass_by(count)
