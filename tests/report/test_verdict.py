@@ -53,6 +53,15 @@ def test_a_tip_that_is_nowhere_is_lost(run):
     assert "tip lost: nan mm" in replace(run, x=x).verdict()
 
 
+def test_commands_beyond_the_motors_limits_are_no_result(run):
+    """A motor that exists would have done something else."""
+    u = run.u.copy()
+    u[4, 0] += 2.0 * run.scene.robot.acceleration_limit * run.scene.period
+    broken = replace(run, u=u)
+    assert broken.verdict() == "commands broke the motors' limits on rate or its change in 2 of 10 periods"
+    assert broken.summary()["failures"] == 1
+
+
 def test_a_run_that_ended_early_is_one_failure(run):
     broken = replace(run, events=[fallback(k) for k in range(9)] + [{"t": 0.1, "kind": "failure", "message": "Boom"}])
     assert broken.summary()["failures"] == 1

@@ -20,10 +20,18 @@ _ANGLE_SLACK = 1e-5
 _POSE_SLACK = 1e-3
 
 
+def too_fast(run: Any) -> np.ndarray:
+    """Control periods in which a command broke the limit on rate or on its change, which no motor does; booleans."""
+    robot, period = run.scene.robot, run.scene.period
+    change = np.diff(run.u, axis=0, prepend=np.zeros((1, robot.n_rods)))
+    found = np.abs(run.u).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.rate_limit
+    found |= np.abs(change).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.acceleration_limit * period
+    return np.asarray(found)
+
+
 def limit_violations(run: Any) -> int:
     """Control periods in which a command broke the limit on rate, on its change, or on the angle."""
     robot, period = run.scene.robot, run.scene.period
-    change = np.diff(run.u, axis=0, prepend=np.zeros((1, robot.n_rods)))
     # Where the command leads from when it arrives, not where the motor's stop lets it get.
     later = UntoldDelay(run.scene.untold_delay, run.dt, robot.n_rods)
     first = run.scene.delay * run.steps_per_period + later.steps
@@ -34,8 +42,7 @@ def limit_violations(run: Any) -> int:
         moved = starts + later.fraction * run.dt * before
         starts = np.clip(moved, np.minimum(lower, starts), np.maximum(upper, starts))
     angles = starts + period * run.u[: len(starts)]
-    broken = np.abs(run.u).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.rate_limit
-    broken |= np.abs(change).max(axis=1, initial=0.0) > (1 + _LIMIT_SLACK) * robot.acceleration_limit * period
+    broken = too_fast(run)
     # Coming back from beyond a stop breaks nothing.
     outside = (angles < lower - _ANGLE_SLACK) & (angles <= starts) | (angles > upper + _ANGLE_SLACK) & (
         angles >= starts

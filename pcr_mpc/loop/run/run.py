@@ -196,8 +196,8 @@ class Run(Frozen):
     def verdict(self) -> str:
         """Why the run is no good, in one line; empty if it is not known to be bad.
 
-        It ended early; or fewer than half of its decisions were solved as asked; or the tip left the reference by more
-        than the scene allows.
+        It ended early; or fewer than half of its decisions were solved as asked; or commands broke the motors' limits
+        on rate or its change; or the tip left the reference by more than the scene allows.
         """
         found = [f"failed at t = {event['t']:.4g} s: {event['message']}" for event in self.events
                  if event["kind"] == "failure"]  # fmt: skip

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...plain import plain
 from .finding import verified
+from .limits import too_fast
 
 
 def summary(run: Any) -> dict[str, Any]:
@@ -78,6 +79,8 @@ def lost(run: Any) -> list[str]:
     solved = len(run.u) - sum(event["kind"] == "fallback" for event in run.events)
     if 2 * solved < len(run.u):
         found.append(f"only {solved} of {len(run.u)} decisions were solved")
+    if broken := int(too_fast(run).sum()):
+        found.append(f"commands broke the motors' limits on rate or its change in {broken} of {len(run.u)} periods")
     if np.isfinite(run.reference).all() and len(run.t):
         worst = int(run.error.argmax())
         if not run.error[worst] <= run.scene.allowed_error:  # so written that NaN is lost
