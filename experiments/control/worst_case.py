@@ -124,9 +124,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tasks = {path: workers.submit(record, path, range(-(-options.steps // n))) for path, n in periods.items()}
         for task in tqdm(as_completed(tasks.values()), desc="simulations", unit="scene", total=len(tasks)):
             task.result()
-    timed = tqdm(tasks.items(), desc="control steps", unit="scene")
-    rows = [measure(path, task.result(), options.repeats) for path, task in timed]
-    write_rows(options.out / "worst_case.csv", rows)
+    rows = []
+    for path, task in tqdm(tasks.items(), desc="control steps", unit="scene"):
+        rows.append(measure(path, task.result(), options.repeats))
+        write_rows(options.out / "worst_case.csv", rows)  # what is measured is kept, whatever happens to the rest
     cells = [[f"{v:.0f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
     print(table(list(rows[0]), cells))
 
