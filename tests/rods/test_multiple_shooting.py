@@ -6,7 +6,7 @@ from scipy.sparse.linalg import splu
 
 from pcr_mpc import load_robot, solve_statics
 from pcr_mpc.plant.rods.closed_form import elastica
-from pcr_mpc.plant.rods.equations import propagation, sample_rod
+from pcr_mpc.plant.rods.equations import Layout, propagation, sample_rod
 from pcr_mpc.plant.rods.shooting.multiple_shooting import robot_residual, rod_newton
 from tests.conftest import DATA, MODELS
 
@@ -106,3 +106,19 @@ def test_conjugate_points_find_the_tabulated_limit():
             *_, scalars = newton(nodes.ravel(order="F"), [*tip, 0.0])
             assert float(scalars[0]) < 1e-6
             assert float(scalars[3]) == expected, (k, factor)
+
+
+@pytest.mark.parametrize(
+    "layout", [None, Layout(0, varying=False, stretching=False), Layout(2, varying=True, stretching=True)]
+)
+def test_calls_for_a_compiler_give_the_same_bits(layout):
+    """Five segments, whose length is no floating-point number."""
+    inlined, called = (rod_newton(5, 2, "rk8", layout, inline=inline) for inline in (True, False))
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        rod = [rng.normal(0.0, 2.0, 20), rng.normal(0.0, 0.5, 3)]
+        if layout:
+            rod.append(rng.uniform(0.5, 1.0, layout.size))
+        for one, other in zip(inlined, called, strict=True):
+            for a, b in zip(one(*rod), other(*rod), strict=True):
+                np.testing.assert_array_equal(a.full(), b.full())

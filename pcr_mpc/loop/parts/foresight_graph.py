@@ -95,6 +95,8 @@ def foresight_graph(
         What the next period starts from is, from the second record on, in the order of the inputs ``records`` to
         ``reckoned``; from the models of the plan on, the outputs are those that `checking` takes in.
     """
+    if not inline:
+        model, target = model.for_compiler(), target.for_compiler()
     n, count = model.kind.n_rods, places.count
     size, of_target = sizes(model), sizes(target)
     inputs = {

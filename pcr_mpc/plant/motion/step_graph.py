@@ -7,7 +7,7 @@ the same arithmetic, without Python in between.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -16,7 +16,7 @@ import numpy as np
 from ...buffered import graph_cache
 from ...compiled import compiled as machine_code
 from ..rods.follower import BRANCH_CHANGE
-from ..rods.method import RodMethod, warm_calls, warm_step
+from ..rods.method import RodMethod, for_compiler, warm_calls, warm_step
 from ..rods.numbers import Kind
 from ..statics.weight import robot_weight
 from .integrators import RK4_STAGES, euler_graph, first_half_graph, second_half_graph, stage_graph, stop_graph
@@ -56,6 +56,10 @@ class StepModel:
     inertia: str
     weight: str
     dt: float
+
+    def for_compiler(self) -> StepModel:
+        """Return the same with the graphs of its rods as a C compiler should be given them."""
+        return replace(self, method=for_compiler(self.method))
 
     @property
     def widths(self) -> tuple[int, int, int]:
@@ -237,8 +241,9 @@ def _step(model: StepModel, corrections: int, *, inline: bool) -> tuple[_WarmMot
 @graph_cache(maxsize=32)
 def step_function(model: StepModel, corrections: int, *, details: bool, compiled: bool) -> Any:
     """`step_graph` as it is, or as machine code."""
-    function = step_graph(model, corrections, details=details)
-    return machine_code(function) if compiled else function
+    if not compiled:
+        return step_graph(model, corrections, details=details)
+    return machine_code(step_graph(model.for_compiler(), corrections, details=details))
 
 
 def limits(model: StepModel) -> list[float]:

@@ -90,6 +90,9 @@ class RodMethod:
         () -> casadi.Function, the condensed inertia of a rod (see `inertia.rod_mass`); built when it is wanted.
     layout : Layout or None
         Of what its graphs take as a third argument. None: they are of plain rods, and take none.
+    by_calls : callable or None
+        () -> ``newton`` and ``residual`` in a form that a C compiler is done with sooner, with the same numbers; None:
+        they are short as they are.
     """
 
     name: str
@@ -107,6 +110,7 @@ class RodMethod:
     to_nodes: Callable[[np.ndarray, float, int], np.ndarray]
     mass: Callable[[], Any]
     layout: Layout | None = None
+    by_calls: Callable[[], tuple[Any, Any]] | None = None
 
 
 def _by_segment(unknowns: np.ndarray, _angle: float, _count: int) -> np.ndarray:
@@ -152,6 +156,7 @@ def shooting_method(shooting: Shooting, layout: Layout | None) -> RodMethod:
         to_nodes=TO_NODES["multiple_shooting"],
         mass=lambda: shooting_inertia.rod_mass(n, steps, shooting.scheme, layout),
         layout=layout,
+        by_calls=lambda: multiple_shooting.rod_newton(n, steps, shooting.scheme, layout, inline=False),
     )
 
 
@@ -244,8 +249,18 @@ def warm_calls(kind: Kind, method: RodMethod, iterations: int) -> Any:
 
 
 @graph_cache(maxsize=16)
+def for_compiler(method: RodMethod) -> RodMethod:
+    """Return the same method with the graphs that a C compiler should be given."""
+    if method.by_calls is None:
+        return method
+    newton, residual = method.by_calls()
+    return replace(method, newton=newton, residual=residual, by_calls=None)
+
+
+@graph_cache(maxsize=16)
 def by_machine_code(method: RodMethod) -> RodMethod:
     """Return the same method with what a rod costs as machine code: one function, whoever calls it how often."""
+    method = for_compiler(method)
     return replace(method, newton=fastest(method.newton), residual=fastest(method.residual))
 
 

@@ -51,7 +51,9 @@ _DETERMINANT_ROUNDING = 1e-12
 
 
 @graph_cache()
-def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = None) -> tuple[Any, Any]:
+def rod_newton(
+    segments: int, steps: int, scheme: str, layout: Layout | None = None, *, inline: bool = True
+) -> tuple[Any, Any]:
     """Build the graphs of one rod in normalised units.
 
     Parameters
@@ -60,6 +62,9 @@ def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = N
         Discretisation.
     layout : Layout, optional
         None: the plain rod. Otherwise both graphs take the rod's numbers (see `RodPhysics`) as a third argument.
+    inline : bool
+        Make one list of instructions of each, for CasADi's interpreter; else call the same small graph for all
+        segments, for a compiler, with the same numbers bit for bit.
 
     Returns
     -------
@@ -76,26 +81,76 @@ def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = N
     """
     n, h = segments, 1.0 / segments
     flat, pose = ca.SX.sym("nodes", 4 * n), ca.SX.sym("pose", 3)
-    arguments = [flat, pose]
+    physics = ca.SX.sym("physics", layout.size if layout else 0)
     z = [flat[4 * j : 4 * j + 4] for j in range(n)]
     z[0] = ca.vertcat(pose[2], flat[1:4])
-    if layout is None:
-        weight = ca.SX(2, 1)
-        ends = [propagation(steps, scheme)(node, h) for node in z]
-    else:
-        physics = ca.SX.sym("physics", layout.size)
-        arguments.append(physics)
-        weight = physics[:2]
-        ends = [propagation(steps, scheme, layout)(node, h, j * h, physics) for j, node in enumerate(z)]
-    gaps = [ends[j][2:6] - z[j + 1] for j in range(n - 1)]
+    arguments = [flat, pose, physics] if layout else [flat, pose]
+    options = {"cse": True}
+    if inline:
+        known = [[j * h, physics] if layout else [] for j in range(n)]
+        ends = [propagation(steps, scheme, layout)(node, h, *at) for node, at in zip(z, known, strict=True)]
+        jacobians = [ca.jacobian(end[:6], node) for end, node in zip(ends, z, strict=True)]
+        newton = ca.Function("rod_newton", arguments, _newton(z, pose, layout, physics, ends, jacobians), options)
+        return newton, ca.Function("rod_residual", arguments, _residual(z, pose, layout, physics, ends), options)
+    ends = [ca.SX.sym("end", 8 if layout else 7) for _ in range(n)]
+    jacobians = [ca.SX.sym("jacobian", 6, 4) for _ in range(n)]
+    side_by_side = [*arguments, ca.horzcat(*ends)]
+    judged = ca.Function("judge", side_by_side, _residual(z, pose, layout, physics, ends), options)
+    side_by_side.append(ca.horzcat(*jacobians))
+    closed = ca.Function("close", side_by_side, _newton(z, pose, layout, physics, ends, jacobians), options)
+
+    given = [ca.MX.sym("nodes", 4 * n), ca.MX.sym("pose", 3), *([ca.MX.sym("physics", layout.size)] if layout else [])]
+    starts = ca.reshape(ca.vertcat(given[1][2], given[0][1:]), 4, n)
+    places = [ca.DM(h * np.arange(n)).T, ca.repmat(given[2], 1, n)] if layout else []
+    moved, turned = (graph.map(n) for graph in _segment(h, steps, scheme, layout))
+    found = moved(starts, *places)
+    newton = ca.Function("rod_newton", given, closed.call([*given, *turned(starts, *places)]))
+    return newton, ca.Function("rod_residual", given, judged.call([*given, found]))
+
+
+@graph_cache()
+def _segment(h: float, steps: int, scheme: str, layout: Layout | None) -> tuple[Any, Any]:
+    """Graphs of a segment of length h from z on, with a layout also of s and the rod's numbers: its end, and its end
+    with the derivatives in z of the first six of it."""
+    z, s, physics = ca.SX.sym("z", 4), ca.SX.sym("s"), ca.SX.sym("physics", layout.size if layout else 0)
+    known = [s, physics] if layout else []
+    end = propagation(steps, scheme, layout)(z, h, *known)
+    jacobian = ca.densify(ca.jacobian(end[:6], z))
+    return (
+        ca.Function("move", [z, *known], [end], {"cse": True}),
+        ca.Function("turn", [z, *known], [end, jacobian], {"cse": True}),
+    )
+
+
+def _judged(z: list[Any], pose: Any, ends: list[Any]) -> tuple[list[Any], Any, Any, Any, Any, Any]:
+    """Gaps between the segments, misses of position and moment at the tip, size of the load, weights, norm of all."""
+    gaps = [end[2:6] - start for end, start in zip(ends, z[1:], strict=False)]
     position = sum(end[:2] for end in ends) - pose[:2]
     moment = ends[-1][5]
     load = 1 + ca.norm_2(z[0][1:3])
     # Angles and positions count as they are: on a taut rod a small miss of the tip is a large error of the force.
     weights = ca.vertcat(1, 1 / load, 1 / load, 1 / ca.sqrt(load))
     norm = ca.norm_2(ca.vertcat(*(weights * gap for gap in gaps), position, weights[3] * moment))
+    return gaps, position, moment, load, weights, norm
 
-    sweep = Sweep([ca.jacobian(end[:6], node) for end, node in zip(ends, z, strict=True)])
+
+def _loads(z: list[Any], weight: Any) -> Any:
+    # The force at the tip is that at the base less the weight in between, which no change of the pose changes.
+    return ca.vertcat(z[0][1:3] - weight, z[0][3])
+
+
+def _residual(z: list[Any], pose: Any, layout: Layout | None, physics: Any, ends: list[Any]) -> list[Any]:
+    """Results of the graph of that name."""
+    *_, norm = _judged(z, pose, ends)
+    return [norm, _loads(z, physics[:2] if layout else ca.SX(2, 1))]
+
+
+def _newton(
+    z: list[Any], pose: Any, layout: Layout | None, physics: Any, ends: list[Any], jacobians: list[Any]
+) -> list[Any]:
+    """Results of the graph of that name, from the ends of the segments and their derivatives in the starts z."""
+    gaps, position, moment, load, weights, norm = _judged(z, pose, ends)
+    sweep = Sweep(jacobians)
     # Column 0 is the Newton step; the others start from a moved or turned base.
     first = ca.DM([[1, 0, 0, 0]])
     steps_at_nodes = [ca.vertcat(0, 0, gap) @ first for gap in gaps]
@@ -103,22 +158,20 @@ def rod_newton(segments: int, steps: int, scheme: str, layout: Layout | None = N
     base_loads = changes[0][3:, :]
     moves = ca.vertcat(*(change[2:, :] for change in changes))
 
-    energy = sum(end[6] for end in ends)
+    energy, n = sum(end[6] for end in ends), len(z)
+    weight = ca.SX(2, 1)
     if layout is None:
         drift = invariant(ends[-1][2:6]) - invariant(z[0])
     else:
+        weight = physics[:2]
         # Each piece counts the energy of its weight from where it begins.
-        energy -= h * sum(ca.dot(weight, end[:2]) * (n - 1 - j) for j, end in enumerate(ends))
+        energy -= 1.0 / n * sum(ca.dot(weight, end[:2]) * (n - 1 - j) for j, end in enumerate(ends))
         drift = invariant(ends[-1][2:6], layout, physics, 1.0) - invariant(z[0], layout, physics, 0.0)
         drift += sum(ca.dot(weight, end[:2]) - end[7] for end in ends)
     length = ca.norm_2(ca.repmat(weights, n, 1) * moves[:, 0])
     scalars = ca.vertcat(norm, length, energy, sweep.conjugate_points(), drift / (load + z[0][3] ** 2 / 2))
-    # The force at the tip is that at the base less the weight in between, which no change of the pose changes.
-    loads = ca.vertcat(z[0][1:3] - weight, z[0][3])
-    results = [moves[:, 0], moves[:, 1:], loads, base_loads[:, 1:], scalars]
-    options = {"cse": True}
-    newton = ca.Function("rod_newton", arguments, [ca.densify(r) for r in results], options)
-    return newton, ca.Function("rod_residual", arguments, [norm, loads], options)
+    results = [moves[:, 0], moves[:, 1:], _loads(z, weight), base_loads[:, 1:], scalars]
+    return [ca.densify(result) for result in results]
 
 
 class Sweep:
