@@ -5,6 +5,7 @@ import struct
 import sys
 import time
 import zlib
+from contextlib import suppress
 
 PERIOD, N = 0.01, 2  # s, motors
 HEAD, ANSWER = "<4sHBBId", "<BBH"
@@ -39,11 +40,9 @@ def main(host, port, periods=10):
         for k in range(int(periods)):
             wire.send(measurement(k, time.monotonic() - began, p, q))
             found = None
-            try:
+            with suppress(OSError):  # no answer in time: keep the last rates for a few periods, then stop by yourself
                 while not found or found[0] < k:  # what comes late is of an older measurement
                     found = command(wire.recv(512))
-            except OSError:
-                pass  # no answer in time: keep the last rates for a few periods, then stop by yourself
             if found and found[0] == k:
                 print(k, "rung", found[1], "rates", *found[2])
                 q = [angle + PERIOD * rate for angle, rate in zip(q, found[2], strict=True)]

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,15 @@ def own_place(options: argparse.Namespace, place: str, other: str = "--out takes
 
 
 def remember(options: argparse.Namespace) -> None:
-    """Note of which scene the results are, if there are new ones in a place that `own_place` gave."""
+    """Note of which scene the results are, if there are new ones in a place that `own_place` gave.
+
+    It is for a warning alone: where it cannot be written, the command is what it was.
+    """
+    with suppress(OSError):
+        _remember(options)
+
+
+def _remember(options: argparse.Namespace) -> None:
     place, begin = getattr(options, "own_place", ("", 0))
     where = _ROOT / place
     if not (place and where.exists()):

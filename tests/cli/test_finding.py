@@ -80,6 +80,14 @@ def test_a_run_of_another_scene_of_the_same_name_is_not_replaced_without_a_word(
     remember(options)
     own_place(Namespace(scene=Path("a/scene.toml")), "plan/mine.csv")
     assert not capsys.readouterr().err
+    # It is for this warning alone: a command is none the worse where it cannot be noted.
+    os.utime(where)
+    (tmp_path / "results" / ".scenes.json").unlink()
+    (tmp_path / "results" / ".scenes.json").mkdir()
+    options = Namespace(scene=Path("c/scene.toml"))
+    own_place(options, "plan/mine.csv")
+    os.utime(where)
+    remember(options)
 
 
 def test_commands_say_whose_results_they_replace(mine, tmp_path, monkeypatch, capsys):

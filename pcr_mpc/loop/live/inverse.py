@@ -16,6 +16,7 @@ from ...plant.motion.plant import Plant
 from ...plant.motion.step_graph import LARGEST_DRIFT, StepModel
 from ...plant.robot import Robot
 from ...plant.rods.follower import BRANCH_CHANGE
+from ...plant.statics.along import least_motion
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.free_tip import inverse_statics
 
@@ -24,7 +25,6 @@ BLOCK = 8
 _SIZES = (BLOCK, 1)
 _ITERATIONS = 2  # of the motor angles, each with one of the rods
 _SOLVED = 1e-8  # residuals of the rods, and of the force over sum EI/L^2
-_SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,11 +166,11 @@ def _rows_graph(model: StepModel, scale: float, count: int) -> Any:
     p0, q, f0, k, g, memory = ca.vertsplit(start, [0, 2, 2 + n, 4 + n, 8 + n, 8 + 3 * n, start.numel()])
     k, g = ca.reshape(k, 2, 2), ca.reshape(g, 2, n)
     p, force = wanted[:2], wanted[2:]
-    q += _least(g, force - f0 - k @ (p - p0))
+    q += least_motion(g, force - f0 - k @ (p - p0))
     rods = force_graph(model, 1)
     for _ in range(_ITERATIONS):
         record, _, found, _, g = rods(ca.vertcat(p, q), memory, numbers)
-        q, memory = q + _least(g, force - found), record[: size.memory]
+        q, memory = q + least_motion(g, force - found), record[: size.memory]
     record, verdict, found, k, g = rods(ca.vertcat(p, q), memory, numbers)
     softest = (k[0, 0] + k[1, 1]) / 2 - ca.sqrt(((k[0, 0] - k[1, 1]) / 2) ** 2 + k[0, 1] ** 2)
     limits = ca.DM([_SOLVED, _SOLVED, BRANCH_CHANGE, 0.0, LARGEST_DRIFT])
@@ -184,12 +184,3 @@ def _rows_graph(model: StepModel, scale: float, count: int) -> Any:
     all_wanted = ca.MX.sym("wanted", 4, count)
     outputs = many(start, all_wanted, ca.repmat(numbers, 1, count))
     return ca.Function("rows", [start, all_wanted, numbers], [outputs[0][:, -1], *outputs[1:]])
-
-
-def _least(g: Any, missing: Any) -> Any:
-    """Least turn of the motors that gives so much more force, G'(G G')^-1, two by two for any number of motors."""
-    square = g @ g.T
-    a, b, d = square[0, 0], square[0, 1], square[1, 1]
-    determinant = a * d - b * b
-    step = g.T @ ca.vertcat(d * missing[0] - b * missing[1], a * missing[1] - b * missing[0]) / determinant
-    return ca.if_else(determinant >= _SINGULAR * a * d, step, ca.DM.zeros(g.size2()))

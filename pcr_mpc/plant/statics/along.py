@@ -27,6 +27,7 @@ _LARGEST_TURN = 0.25  # of the motors from one pose to the next [rad]
 _ROUGHLY = 1e-2  # force that may be missing before the last step, in units of sum EI/L^2: about its square is left
 _EXACTLY = 1e-9
 _POLISHES = 3
+_SINGULAR = 1e-9  # det(G G') relative to its diagonal, below which the motors have lost a direction
 
 
 def inverse_statics_along(robot: Robot, p: Any, force: Any, guess: Equilibrium) -> Equilibria:
@@ -158,7 +159,7 @@ def _path_graph(kind: Kind, method: RodMethod, count: int) -> Any:
     pose, record, result = ca.vertsplit(state, [0, pose_size, pose_size + record_size, state.numel()])
     p, wanted = target[:2], target[2:]
     force, k, g = _parts(result, n)
-    turned = pose[2:] + _least_motion(g, wanted - force - k @ (p - pose[:2]))
+    turned = pose[2:] + least_motion(g, wanted - force - k @ (p - pose[:2]))
     changed = conjugate_points = residual = ca.MX(0)
     for _ in range(_TRIALS):
         reached = turned
@@ -166,7 +167,7 @@ def _path_graph(kind: Kind, method: RodMethod, count: int) -> Any:
         residual, changed, conjugate_points = verdict[0], changed + verdict[2], conjugate_points + verdict[3]
         force, k, g = _parts(result, n)
         missed = wanted - force
-        turned = reached + _least_motion(g, missed)
+        turned = reached + least_motion(g, missed)
     moved = ca.vertcat(p, reached, record, result)
     half, skew = (k[0, 0] - k[1, 1]) / 2, (k[0, 1] + k[1, 0]) / 2
     softest = (k[0, 0] + k[1, 1]) / 2 - ca.norm_2(ca.vertcat(half, skew))
@@ -183,8 +184,10 @@ def _parts(result: Any, n: int) -> tuple[Any, Any, Any]:
     return result[:2], ca.reshape(result[2:6], 2, 2), ca.reshape(result[6:], 2, n)
 
 
-def _least_motion(g: Any, force: Any) -> Any:
-    """G^+ force, for G of full rank."""
+def least_motion(g: Any, force: Any) -> Any:
+    """G^+ force, the least turn of the motors that gives so much more; none where they have lost a direction."""
     square = g @ g.T
-    (a, b), (c, d) = (square[0, 0], square[0, 1]), (square[1, 0], square[1, 1])
-    return g.T @ ca.vertcat(d * force[0] - b * force[1], a * force[1] - c * force[0]) / (a * d - b * c)
+    a, b, d = square[0, 0], square[0, 1], square[1, 1]
+    determinant = a * d - b * b
+    step = g.T @ ca.vertcat(d * force[0] - b * force[1], a * force[1] - b * force[0]) / determinant
+    return ca.if_else(determinant >= _SINGULAR * a * d, step, ca.DM.zeros(g.size2()))

@@ -1,0 +1,79 @@
+"""Plans that reckon with what rods are: their mass and weight."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pcr_mpc import (
+    PlanLimits,
+    check_scene,
+    load_scene,
+    make_controller,
+    plan_timing,
+    simulate,
+)
+from pcr_mpc.report.designs.plan_table import plan_table
+from pcr_mpc.study.planning import rods_mass
+from pcr_mpc.study.planning.plan import rods_left_out
+from tests.conftest import MODELS
+from tests.study.planning.by_statics import motors
+
+
+def test_limits_are_lowered_until_with_the_rods_mass_none_is_exceeded_by_anything(scene, planned, monkeypatch):
+    """A motor that is asked for half a thousandth too much is one that `check_scene` refuses."""
+    model = replace(scene.tuning.model, inertia="condensed")
+    heavy, limits = replace(scene, tuning=replace(scene.tuning, model=model)), PlanLimits.of_scene(scene)
+    kept = []
+
+    def asked(*_):
+        share = 1.0005 * kept[-1].acceleration / limits.acceleration
+        return {"rate": 1.0, "acceleration": share * limits.acceleration, "torque": 0.1}
+
+    monkeypatch.setattr(rods_mass, "asked_of_motors", asked)
+    found = rods_mass.with_rods(heavy, limits, 0.0, lambda lowered: kept.append(lowered) or planned)
+    assert len(kept) == found.rods.rounds == 2
+    assert found.rods.acceleration <= limits.acceleration
+
+
+@pytest.mark.slow
+def test_a_plan_reckons_with_the_rods_inertia_that_the_controller_knows(scene):
+    """Of rods three times as heavy: where a plan without it asks for too much, one with it does not, and is slower."""
+    rods = tuple(replace(rod, line_density=3.0 * rod.line_density) for rod in scene.robot.rods)
+    model = replace(scene.tuning.model, inertia="condensed")
+    heavy = replace(scene, robot=replace(scene.robot, rods=rods), tuning=replace(scene.tuning, model=model))
+
+    def tracked(planned):
+        duration = heavy.period * (math.ceil(planned.duration / heavy.period) + 20)
+        return replace(heavy, trajectory=planned, duration=duration)
+
+    light = plan_timing(replace(heavy, tuning=scene.tuning), cells=40)
+    assert light.rods is None
+    (line,) = (line for line in check_scene(tracked(light)) if "change its rate by" in line)
+    left_out = rods_left_out(replace(heavy, tuning=scene.tuning), light)
+    assert f"change its rate by {left_out.acceleration:.4g} rad" in line.replace("by -", "by ")
+    planned = plan_timing(heavy, cells=40)
+    assert check_scene(tracked(planned)) == []
+    assert light.duration < planned.duration < 1.3 * light.duration
+    assert planned.rods.acceleration == pytest.approx(heavy.robot.acceleration_limit, rel=2e-2)
+    assert planned.limits.acceleration < heavy.robot.acceleration_limit
+    assert "lowered for that" in plan_table(planned.summary() | {"share_of_rods": 0.1})
+    # A plant whose rods have that mass, led by a controller that knows it.
+    there = replace(tracked(planned), plant=replace(heavy.plant, inertia="condensed"))
+    run = simulate(there, there.make_plant(), make_controller(there))
+    assert not run.summary()["limit_violations"]
+    assert run.summary()["max_mm"] < 0.5
+
+
+@pytest.mark.slow
+def test_rods_with_weight_are_planned_for_by_shooting(scene):
+    vertical = load_scene(MODELS / "scenes" / "vertical.toml")
+    heavy = replace(scene, robot=vertical.robot)
+    planned = plan_timing(heavy, cells=40)
+    assert planned.excess <= 1e-3
+    t = np.linspace(0.0, planned.duration, 801)
+    q = np.stack([eq.q for eq in motors(heavy.robot, planned, t, heavy.start())])
+    assert np.abs(np.diff(q, axis=0)).max() / t[1] <= 1.001 * heavy.robot.rate_limit
+    assert np.abs(np.diff(q, 2, axis=0)).max() / t[1] ** 2 <= 1.001 * heavy.robot.acceleration_limit
+    assert np.abs(q - scene.start().q).max() > 0.1
