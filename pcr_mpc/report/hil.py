@@ -16,6 +16,8 @@ _SAME = 1e-9  # mm, that another machine's rounding may differ by
 _REMARKABLE = 0.25  # of a period
 _OFTEN = 0.25  # of a period, that the mean may be above what most commands take
 
+_ABOVE: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}  # legends hide no point
+
 
 def hil_table(summary: dict[str, Any]) -> str:
     """Figures of a run."""
@@ -80,8 +82,8 @@ def plot_hil(run: HilRun, path: Path) -> None:
                   label=f"simulated, commands {summary['simulated_delay_ms']:.3g} ms late: "
                   f"{_rms(summary['simulated_rms_mm'])}")  # fmt: skip
     error.set(xlim=(0.0, run.t[-1]), ylim=(0.0, None), xlabel="time [s]", ylabel="error of the tip [mm]")
-    error.set_title(f"{run.scene.name} over a wire: RMS {summary['rms_mm']:.3g} mm")
-    error.legend(loc="upper left")
+    figure.suptitle(f"{run.scene.name} over a wire: RMS {summary['rms_mm']:.3g} mm")
+    error.legend(**_ABOVE)
 
     t = run.scene.period * np.arange(len(run.round_trip))
     missing = np.isnan(run.round_trip)
@@ -91,7 +93,7 @@ def plot_hil(run: HilRun, path: Path) -> None:
         trips.plot(t[missing], np.full(missing.sum(), 1e3 * run.scene.period), "x", color=RED, ms=5,
                    label=f"{missing.sum()} missed")  # fmt: skip
     trips.set(xlim=(0.0, run.t[-1]), xlabel="time [s]", ylabel="round trip [ms]")
-    trips.legend(loc="upper right")
+    trips.legend(**_ABOVE, ncols=3)
 
     bins = np.logspace(0.0, max(1.0, np.log10(1e6 * max(run.late.max(), 1e-6))), 60)
     late.hist(1e6 * np.maximum(run.late, 1e-6), bins=bins, color=BLUE)
