@@ -26,6 +26,19 @@ def test_a_program_that_grows_has_the_optimum_of_one_solved_anew(capfd):
             x = program.solved()
             assert costs @ x == pytest.approx(anew.fun, abs=1e-9)
             assert (dense[:rows] @ x <= scale * high[:rows] + 1e-9).all()
+    # Another program that begins at this one's answer has all its rows in the end, and its own optimum.
+    held = program.held()
+    assert 0 < held.sum() <= 12 and dense[held] @ x == pytest.approx(0.7 * high[held])
+    other_costs = costs + rng.normal(scale=0.3, size=12)
+    other = LinearProgram(other_costs)
+    other.bound(np.full(12, -0.5), np.full(12, 0.5))
+    for rows in (held, ~held):
+        other.add_rows(np.full(rows.sum(), -np.inf), high[rows], columns[rows], values[rows])
+        if rows is held:
+            other.begin_as(program)
+            assert other.held().all()
+    anew = linprog(other_costs, dense, high, bounds=[(-0.5, 0.5)] * 12)
+    assert other_costs @ other.solved() == pytest.approx(anew.fun, abs=1e-9)
     program.bound_rows(np.full(60, 1e3), np.full(60, np.inf))
     with pytest.raises(ConvergenceError, match="not solved: Infeasible"):
         program.solved()

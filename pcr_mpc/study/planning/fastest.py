@@ -61,9 +61,10 @@ def faster(
     ConvergenceError
         The linear program was not solved.
     """
+    basis, program = _Basis(timing), None
     for _ in range(most):
         interrupt.check()
-        program = _Program(timing.with_slopes(), allowed)
+        program = _Program(timing.with_slopes(), allowed, basis, program)
         # Limits are to be kept, however little time that takes.
         enough = min(tolerance, _REPAIRED * program.beyond) if program.beyond > _KEPT else tolerance
         found = None
@@ -85,6 +86,19 @@ def faster(
     return timing
 
 
+class _Basis:
+    """The splines that b is made of, at the points where limits are kept and where time is counted.
+
+    Few of them count at each point: which, and how b and its derivatives change with them.
+    """
+
+    def __init__(self, timing: Timing) -> None:
+        pace = timing.pace
+        self.nodes, self.weights = quadrature(pace)
+        self.at_nodes = unit_splines(pace)(self.nodes)
+        self.columns, self.values = local_basis(pace, timing.x, ORDERS_OF_PACE)
+
+
 class _Program:
     """The linear program at one pace.
 
@@ -92,6 +106,10 @@ class _Program:
     ----------
     timing : Timing
     allowed : float
+    basis : _Basis
+        At its points.
+    last : _Program, optional
+        At the same points; its answer is where the search for this one's begins.
 
     Attributes
     ----------
@@ -99,16 +117,13 @@ class _Program:
         By how much more than what is allowed of a limit is used.
     """
 
-    def __init__(self, timing: Timing, allowed: float) -> None:
+    def __init__(self, timing: Timing, allowed: float, basis: _Basis, last: _Program | None) -> None:
         self._timing, self._allowed = timing, allowed
         pace = timing.pace
-        x, weights = quadrature(pace)
         # Unknowns: relative changes of the coefficients of b.
-        gradient = -0.5 * (weights * pace(x) ** -1.5) @ unit_splines(pace)(x) / timing.duration * pace.c
-        self._gradient = gradient
-        # Few of them count at each point: which, and how b and its derivatives change with them.
-        columns, values = local_basis(pace, timing.x, ORDERS_OF_PACE)
-        self._columns, self._values = columns, values * pace.c[columns]
+        by_own = -0.5 * (basis.weights * pace(basis.nodes) ** -1.5) @ basis.at_nodes
+        self._gradient = by_own / timing.duration * pace.c
+        self._columns, self._values = basis.columns, basis.values * pace.c[basis.columns]
         shares = [use.share.slope[:, i] for use in timing.uses for i in range(use.share.slope.shape[1])]
         self._slopes = np.concatenate([np.einsum("mo,omj->mj", slope, self._values) for slope in shares])
         self._where = np.tile(self._columns, (len(shares), 1))
@@ -118,6 +133,8 @@ class _Program:
         self._program = LinearProgram(np.append(self._gradient, _PENALTY))
         self._known = np.zeros((2, len(self._both)), dtype=bool)
         self._rows = np.empty(0, dtype=int), np.empty(0)
+        if last is not None:
+            self._go_on_from(last)
 
     def step(self, trust: float, tolerance: float) -> tuple[float, tuple[float, Timing] | None]:
         """Return the gain that is predicted, and what was gained and the timing that gains it; None: not enough."""
@@ -142,6 +159,14 @@ class _Program:
             # What the slopes do not know is taken for the same in the next try.
             rest = _stacked(trial) - (self._slopes * change[self._where]).sum(axis=1)
         return predicted, best if best is not None and best[0] > _LEAST_GAIN * predicted else None
+
+    def _go_on_from(self, last: _Program) -> None:
+        """Begin with the limits that held the last program's answer, and with that answer."""
+        rows, signs = (of_rows[last._program.held()] for of_rows in last._rows)
+        above, below = np.zeros_like(self._known)
+        above[rows[signs > 0.0]] = below[rows[signs < 0.0]] = True
+        self._add(above, below, _stacked(self._timing))
+        self._program.begin_as(last._program)
 
     def _excess(self, timing: Timing) -> float:
         return max(timing.worst - self._allowed, 0.0)

@@ -31,11 +31,13 @@ def points(cells: int, per_cell: int = PER_CELL) -> np.ndarray:
 
 
 def with_points(x: np.ndarray, shares: np.ndarray, fine: np.ndarray, allowed: float) -> np.ndarray:
-    """Add the fine points at which a limit's share, shape (limits, K), is more than allowed, and their neighbours."""
-    beyond = np.asarray((shares > allowed).any(axis=0))
-    # The neighbours too, to which a peak would move.
-    beyond[1:-1] |= beyond[:-2] | beyond[2:]
-    new = fine[beyond]
+    """Add the fine points at which a limit's share, shape (limits, K), is largest and more than allowed.
+
+    Their neighbours too, to which a peak would move.
+    """
+    beside = np.pad(shares, ((0, 0), (1, 1)), constant_values=-np.inf)
+    peaks = (shares > allowed) & (shares >= beside[:, :-2]) & (shares >= beside[:, 2:])
+    new = fine[np.convolve(peaks.any(axis=0), [1, 1, 1], mode="same") > 0]
     apart = 0.01 * float(np.diff(fine).min())
     new = new[(np.abs(new[:, None] - x) > apart).all(axis=1)]
     return np.sort(np.concatenate([x, new]))

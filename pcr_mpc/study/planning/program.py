@@ -81,6 +81,17 @@ class LinearProgram:
             )
         return np.array(self._solver.getSolution().col_value)
 
+    def held(self) -> np.ndarray:
+        """Which rows hold the last answer, shape (R,); there must be one."""
+        basic = highspy.HighsBasisStatus.kBasic
+        return np.array([status != basic for status in self._solver.getBasis().row_status], dtype=bool)
+
+    def begin_as(self, other: LinearProgram) -> None:
+        """Begin at another program's answer; the rows here, with their upper bounds, are those that hold it."""
+        basis = other._solver.getBasis()
+        basis.row_status = [highspy.HighsBasisStatus.kUpper] * self._solver.getNumRow()
+        self._demand(self._solver.setBasis(basis))
+
     def _demand(self, status: Any) -> None:
         if status == highspy.HighsStatus.kError:
             raise ConvergenceError(
