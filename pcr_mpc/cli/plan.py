@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import math
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +36,6 @@ def plan(options: argparse.Namespace) -> int:
         if name in ("tip_speed", "tip_acceleration", "tip_jerk")
     }
     begin = time.perf_counter()
-    if picture is not None:  # meanwhile: Matplotlib takes half a second to import, and the plan leaves Python to wait
-        drawing = ThreadPoolExecutor(1).submit(importlib.import_module, "pcr_mpc.report.designs.plan_picture")
     planned = plan_timing(
         scene,
         limits=PlanLimits.of_scene(scene, **more),
@@ -56,7 +52,9 @@ def plan(options: argparse.Namespace) -> int:
     def write(folder: Path) -> None:
         write_text(folder / out.name, stamped(planned.csv()))
         if picture is not None:
-            drawing.result().plot_plan(planned, folder / picture.name)
+            from ..report.designs.plan_picture import plot_plan  # Matplotlib, which takes half a second to import
+
+            plot_plan(planned, folder / picture.name)
 
     folder, problem = saved(write, out.parent)
     names = [out.name] if picture is None else [out.name, picture.name]
