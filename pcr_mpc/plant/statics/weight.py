@@ -19,7 +19,7 @@ import numpy as np
 
 from ...buffered import BufferedFunction, graph_cache
 from ..robot import Robot
-from ..rods.closed_form.inertia import Point, along, by_pose_of_tip, seen_along_force, turned
+from ..rods.closed_form.inertia import along, by_pose_of_tip, point_at, seen_along_force, turned
 from ..rods.numbers import Kind
 from .equilibrium import Equilibrium
 
@@ -83,12 +83,12 @@ def _rod_weight() -> tuple[Any, Any]:
     """
     unknowns, angle, down = ca.SX.sym("unknowns", 3), ca.SX.sym("angle"), ca.SX.sym("down", 2)
     log_tip_angle, load, hand = ca.vertsplit(unknowns)
-    base = Point(log_tip_angle, load, any_pull=True)
+    base = point_at(log_tip_angle, load, any_pull=True)
     tip = along(base, None, 0.0, load)
     mean = [ca.SX(2, 1)] * len(tip)
     for x, share in zip(*np.polynomial.legendre.leggauss(_POINTS), strict=True):
         sigma = (1 - x) / 2
-        there = along(base, Point(log_tip_angle, load * sigma, any_pull=True), sigma, load)
+        there = along(base, point_at(log_tip_angle, load * sigma, any_pull=True), sigma, load)
         mean = [so_far + share / 2 * part for so_far, part in zip(mean, there, strict=True)]
     view = seen_along_force(hand * angle + base.delta, hand)
     e = view[:2, :2] @ down

@@ -16,7 +16,7 @@ Y eta' - sin(delta) eta = -sin(alpha) (their Wronskian); second derivatives by d
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -35,41 +35,69 @@ _LANDEN_STEPS = 5
 _SMALLEST = -300.0
 
 
-class Point:
-    """F = (C, -Y) and delta at u with their derivatives in a = log(alpha) and u: tip to point, seen along the force.
+class Point(NamedTuple):
+    """F = (C, -Y) and delta at u with their derivatives in a = log(alpha) and u: tip to point, seen along the force."""
+
+    f: Any
+    f_a: Any
+    f_u: Any
+    f_aa: Any
+    f_au: Any
+    f_uu: Any
+    delta: Any
+    delta_a: Any
+    delta_u: Any
+    delta_aa: Any
+    delta_au: Any
+    delta_uu: Any
+
+
+def point_at(log_tip_angle: Any, u: Any, *, any_pull: bool = False) -> Point:
+    """Return the point at u.
 
     Right up to a = -300, and beyond with ``any_pull``; see `pendulum`.
     """
+    return Point(*_point(any_pull=any_pull)(log_tip_angle, u))
 
-    def __init__(self, log_tip_angle: Any, u: Any, *, any_pull: bool = False) -> None:
-        alpha = ca.exp(ca.fmax(log_tip_angle, _SMALLEST) if any_pull else log_tip_angle)
-        k, k_prime = ca.cos(alpha / 2), ca.sin(alpha / 2)
-        if any_pull:
-            (cos, sin, y, c), half = swing(log_tip_angle, u, any_pull=True)
-            w = u * ca.cos(alpha) - c
-        else:
-            sn, cn, dn, d = elliptic(u, k, k_prime, _LANDEN_STEPS)
-            half = k_prime / dn, k * cn / dn
-            sin, cos = 2 * half[0] * half[1], 1 - 2 * half[0] ** 2
-            y, w = 2 * k * sn * half[0], 2 * (d - k_prime**2 * u)
-        sin_alpha, cos_alpha = 2 * k * k_prime, 1 - 2 * k_prime**2
-        over = alpha / (2 * sin_alpha)
-        pull, damp = u * alpha * sin_alpha, 1 - alpha * cos_alpha / sin_alpha
-        eta = (2 * sin + w * y) * over
-        y_a = (2 * cos * y + y**3 / 2 + w * sin) * over
-        w_a = (y * eta - pull) / 2
-        eta_a = (2 * cos * eta + w_a * y + w * y_a) * over + damp * eta
-        y_aa = ((2 * cos + 1.5 * y**2) * y_a - 2 * sin * eta * y + w_a * sin + w * cos * eta) * over + damp * y_a
-        c_aa = -(pull + u * alpha**2 * cos_alpha + y_a * eta + y * eta_a) / 2
-        self.f = ca.vertcat(u * cos_alpha - w, -y)
-        self.f_a = ca.vertcat(-(pull + y * eta) / 2, -y_a)
-        self.f_u = ca.vertcat(cos, -sin)
-        self.f_aa = ca.vertcat(c_aa, -y_aa)
-        self.f_au = -eta * ca.vertcat(sin, cos)
-        self.f_uu = -y * ca.vertcat(sin, cos)
-        self.delta = 2 * ca.atan2(*half)
-        self.delta_a, self.delta_u = eta, y
-        self.delta_aa, self.delta_au, self.delta_uu = eta_a, y_a, sin
+
+@graph_cache()
+def _point(*, any_pull: bool) -> Any:
+    """Graph of `point_at`, which CasADi copies into others faster than Python writes it down again."""
+    log_tip_angle, u = ca.SX.sym("log_tip_angle"), ca.SX.sym("u")
+    alpha = ca.exp(ca.fmax(log_tip_angle, _SMALLEST) if any_pull else log_tip_angle)
+    k, k_prime = ca.cos(alpha / 2), ca.sin(alpha / 2)
+    if any_pull:
+        (cos, sin, y, c), half = swing(log_tip_angle, u, any_pull=True)
+        w = u * ca.cos(alpha) - c
+    else:
+        sn, cn, dn, d = elliptic(u, k, k_prime, _LANDEN_STEPS)
+        half = k_prime / dn, k * cn / dn
+        sin, cos = 2 * half[0] * half[1], 1 - 2 * half[0] ** 2
+        y, w = 2 * k * sn * half[0], 2 * (d - k_prime**2 * u)
+    sin_alpha, cos_alpha = 2 * k * k_prime, 1 - 2 * k_prime**2
+    over = alpha / (2 * sin_alpha)
+    pull, damp = u * alpha * sin_alpha, 1 - alpha * cos_alpha / sin_alpha
+    eta = (2 * sin + w * y) * over
+    y_a = (2 * cos * y + y**3 / 2 + w * sin) * over
+    w_a = (y * eta - pull) / 2
+    eta_a = (2 * cos * eta + w_a * y + w * y_a) * over + damp * eta
+    y_aa = ((2 * cos + 1.5 * y**2) * y_a - 2 * sin * eta * y + w_a * sin + w * cos * eta) * over + damp * y_a
+    c_aa = -(pull + u * alpha**2 * cos_alpha + y_a * eta + y * eta_a) / 2
+    found = Point(
+        f=ca.vertcat(u * cos_alpha - w, -y),
+        f_a=ca.vertcat(-(pull + y * eta) / 2, -y_a),
+        f_u=ca.vertcat(cos, -sin),
+        f_aa=ca.vertcat(c_aa, -y_aa),
+        f_au=-eta * ca.vertcat(sin, cos),
+        f_uu=-y * ca.vertcat(sin, cos),
+        delta=2 * ca.atan2(*half),
+        delta_a=eta,
+        delta_u=y,
+        delta_aa=eta_a,
+        delta_au=y_a,
+        delta_uu=sin,
+    )
+    return ca.Function("point", [log_tip_angle, u], list(found))
 
 
 def along(base: Point, point: Point | None, sigma: float, load: Any) -> list[Any]:
@@ -78,9 +106,7 @@ def along(base: Point, point: Point | None, sigma: float, load: Any) -> list[Any
     None: the tip itself.
     """
     zero = ca.SX(2, 1)
-    f, f_a, f_u, f_aa, f_au, f_uu = (
-        [zero] * 6 if point is None else [point.f, point.f_a, point.f_u, point.f_aa, point.f_au, point.f_uu]
-    )
+    f, f_a, f_u, f_aa, f_au, f_uu = [zero] * 6 if point is None else point[:6]
     g, g_a = (base.f - f) / load, (base.f_a - f_a) / load
     g_l = (base.f_u - sigma * f_u - g) / load
     g_aa = (base.f_aa - f_aa) / load
@@ -132,11 +158,11 @@ def rod_mass() -> Any:
     """
     unknowns, angle = ca.SX.sym("unknowns", 3), ca.SX.sym("angle")
     log_tip_angle, load, hand = ca.vertsplit(unknowns)
-    base = Point(log_tip_angle, load)
+    base = point_at(log_tip_angle, load)
     tip = along(base, None, 0.0, load)
     moments, slopes = ca.SX(6, 1), ca.SX(6, 2)
     for sigma, weight in zip(*_quadrature(_POINTS), strict=True):
-        point = Point(log_tip_angle, load * sigma) if sigma else None
+        point = point_at(log_tip_angle, load * sigma) if sigma else None
         values, changes = _moments(along(base, point, sigma, load))
         moments += weight * ca.vertcat(*values)
         slopes += weight * ca.horzcat(*(ca.vertcat(*change) for change in changes))

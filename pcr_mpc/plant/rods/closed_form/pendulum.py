@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from ....buffered import graph_cache
+
 # Ascending Landen steps: k' falls below 1e-16 from any k >= 1e-6.
 _LANDEN_STEPS = 8
 # Logarithm of the smallest k' of which powers are taken, and of the unit that then takes its place, over k'.
@@ -26,6 +28,18 @@ def elliptic(
     With the logarithm of k' too, cn and dn are given in units of k' exp(_SHIFT) where k' is `beyond_numbers`, for there
     neither it nor they are floating-point numbers, and what is wanted are their ratios.
     """
+    if log_k_prime is None:
+        found: tuple[Any, Any, Any, Any] = _elliptic(steps, shifted=False)(u, k, k_prime)
+    else:
+        found = _elliptic(steps, shifted=True)(u, k, k_prime, log_k_prime)
+    return found
+
+
+@graph_cache()
+def _elliptic(steps: int, *, shifted: bool) -> Any:
+    """Graph of `elliptic`, which CasADi copies into others faster than Python writes it down again."""
+    arguments = [ca.SX.sym(name) for name in ("u", "k", "k_prime", "log_k_prime")[: 4 if shifted else 3]]
+    u, k, k_prime = arguments[:3]
     moduli, factor = [], ca.SX(1)
     for _ in range(steps):
         twice = 2 / (1 + k)  # divisions take long, and CasADi makes them of reciprocals
@@ -33,10 +47,10 @@ def elliptic(
         factor *= (1 + k) / 2
         k, k_prime = ca.sqrt(k) * twice, (k_prime / 2 * twice) ** 2
     u = u_shifted = u * factor
-    if log_k_prime is not None:
+    if shifted:
         # As cosh(x) is exp(x)/2, cosh(u) k' exp(_SHIFT) is cosh of the sum, but near the tip, where all is straight.
-        tiny = beyond_numbers(log_k_prime)
-        u_shifted = ca.if_else(tiny, ca.fmax(u + log_k_prime + _SHIFT, 0), u)
+        tiny = beyond_numbers(arguments[3])
+        u_shifted = ca.if_else(tiny, ca.fmax(u + arguments[3] + _SHIFT, 0), u)
         moduli[0] = *moduli[0][:2], ca.if_else(tiny, math.exp(-_SHIFT), moduli[0][2]), moduli[0][3]
     sn, dn = ca.tanh(u), 1 / ca.cosh(u_shifted)
     cn, d = dn, ca.SX(0)
@@ -46,7 +60,7 @@ def elliptic(
         sn, cn, dn = twice * sn * cn / dn, (1 + k) / (2 * k) * (dn - ratio), (1 + k) / 2 * (dn + ratio)
         d = (1 + k) * d + k_prime**2 / 2 * twice * u + k * sn * (1 - k * cn / dn)
         u = u * twice
-    return sn, cn, dn, d
+    return ca.Function("elliptic", arguments, [sn, cn, dn, d])
 
 
 def beyond_numbers(log_k_prime: Any) -> Any:
