@@ -28,7 +28,8 @@ def test_a_program_that_grows_has_the_optimum_of_one_solved_anew(capfd):
             assert (dense[:rows] @ x <= scale * high[:rows] + 1e-9).all()
     # Another program that begins at this one's answer has all its rows in the end, and its own optimum.
     held = program.held()
-    assert 0 < held.sum() <= 12 and dense[held] @ x == pytest.approx(0.7 * high[held])
+    assert 0 < held.sum() <= 12
+    assert dense[held] @ x == pytest.approx(0.7 * high[held])
     other_costs = costs + rng.normal(scale=0.3, size=12)
     other = LinearProgram(other_costs)
     other.bound(np.full(12, -0.5), np.full(12, 0.5))

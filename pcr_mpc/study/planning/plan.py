@@ -15,14 +15,14 @@ from .course import paced
 from .fastest import faster
 from .free import Freed, freed, way_points
 from .limits import PlanLimits
-from .meshing import FINE, points, repaced, with_points
+from .meshing import FINE, checked_at, points, repaced, with_points
 from .motion import Carrier
 from .pace import cells_of, spline_of, times
 from .path import TipPath, path_of
 from .rods_mass import asked_of_motors, with_rods
 from .starting import STATICS, evened, started, where
 from .timed_path import Paced, RodsMass, TimedPath
-from .timing import NEAR, Problem, Timing
+from .timing import EXACT, NEAR, Problem, Timing
 
 _CELL = 1e-2  # s
 _FEWEST, _MOST = 80, 240  # cells
@@ -154,7 +154,7 @@ def _planned(
     timing = faster(evened(started(problem, path)), most=_ITERATIONS[0], tolerance=_GAINS[0], told=counted)
     wanted = cells or int(np.clip(math.ceil(timing.duration / _CELL), _FEWEST, _MOST))
     timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
-    timing = faster(timing, most=_ITERATIONS[1], trust=0.3, allowed=_ALLOWED, tolerance=_GAINS[1], told=counted)
+    timing = faster(timing, most=_ITERATIONS[1], allowed=_ALLOWED, tolerance=_GAINS[1], told=counted)
     if points_between is not None:
         found = freed(timing, points_between, wanted, _ALLOWED)
         return _free_result(name, found, path, problem.limits, iterations + found.iterations)
@@ -194,31 +194,28 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tupl
         They are not kept to a thousandth.
     """
     per_cell = FINE // 3  # which finds most
-    between = points(cells_of(timing.pace), per_cell)
-    fine, exact = timing.at(between, NEAR), False
+    between, tolerance = points(cells_of(timing.pace), per_cell), NEAR
     for _ in range(_ROUNDS):
-        kept = fine.worst <= 1.0 + _EXCESS
-        if kept and exact:
-            return timing, fine
-        if kept:
-            if per_cell != FINE:
-                per_cell, between = FINE, points(cells_of(timing.pace), FINE)
-                fine = timing.at(between, NEAR)
-            else:
-                fine, exact = fine.at(between), True
+        fine, checked = checked_at(timing, between, tolerance, suspect=1.0 + _EXCESS)
+        if checked.worst <= 1.0 + _EXCESS:
+            if tolerance == EXACT:
+                return timing, fine
+            if per_cell == FINE:
+                tolerance = EXACT
+            per_cell, between = FINE, points(cells_of(timing.pace), FINE)
             continue
-        x = with_points(timing.x, fine.shares, between, _ALLOWED)
+        x = with_points(timing.x, checked, _ALLOWED)
         more = faster(timing.at(x), most=_ITERATIONS[2], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
         if more.pace is timing.pace and len(x) == len(timing.x):
             break
-        timing, fine, exact = more, more.at(between, NEAR), False
-    if fine.worst > 1.0 + _LARGEST_EXCESS:
-        limit, at = np.unravel_index(int(fine.shares.argmax()), fine.shares.shape)
+        timing, tolerance = more, NEAR
+    if checked.worst > 1.0 + _LARGEST_EXCESS:
+        limit, at = np.unravel_index(int(checked.shares.argmax()), checked.shares.shape)
         raise ConvergenceError(
-            f"the plan still exceeds the limit on {fine.uses[limit].limit} by {100 * (fine.worst - 1):.3g} % at "
-            f"{times(fine.pace, between)[at]:.4f} s after {_ROUNDS} refinements; take more cells than "
+            f"the plan still exceeds the limit on {fine.uses[limit].limit} by {100 * (checked.worst - 1):.3g} % at "
+            f"{times(fine.pace, checked.x)[at]:.4f} s after {_ROUNDS} refinements; take more cells than "
             f"{cells_of(fine.pace)}",
-            residual=fine.worst - 1.0,
+            residual=checked.worst - 1.0,
             iterations=_ROUNDS,
             last=fine.pace.c,
         )

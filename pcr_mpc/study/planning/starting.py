@@ -24,7 +24,7 @@ _POWERS = {"change of rate": 3.0, "tip acceleration": 2.0, "tip jerk": 3.0, "mot
 _TRIALS, _ESTIMATES = 40, 20
 _AIM, _NEAR_ENOUGH = 0.8, 0.8  # of the limits; of the duration that is expected to use so much of them
 # Cells over which the speed is changed, by what at most; the largest share to begin with.
-_REACH, _LARGEST_CHANGE, _WORST_START, _SWEEPS = 3, 3.0, 1.2, 4
+_REACH, _LARGEST_CHANGE, _WORST_START, _SWEEPS = 3, 3.0, 1.2, 8
 
 
 def evened(timing: Timing) -> Timing:
