@@ -201,6 +201,8 @@ def _iterations(axis: Any, rows: list[dict[str, Any]]) -> None:
                       textcoords="offset points")  # fmt: skip
     axis.set(xlabel="QP iterations (number of steps beside the axis)", ylabel="control step [us]")
     axis.set_ylim(0, 1.15 * max(row["p99"] for row in rows))
+    axis.set_xlim(min(count) - 0.5, max(count) + 0.5)
+    axis.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)  # there are no parts of an iteration
     axis.set_title("Iterations")
     axis.legend(fontsize=8)
 
