@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ _FEWEST, _MOST = 8, 1024  # pieces of the spline
 _SPARE = 0.1  # of the tolerance, which a plain fit may use
 _PENALTIES, _BISECTIONS = (1e-30, 1e-8), 14  # to one part in a hundred
 _STILL = 1e-9  # of the path's length: a step between samples that is none
+_CORNER, _AT_REST = 0.02, 1e-2  # turn from step to step where the tip rests [rad]; share of its largest speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +52,8 @@ class TipPath(Frozen):
         return np.stack([self.spline(s, nu=order) for order in range(5)])
 
 
-def path_of(trajectory: Trajectory, duration: float, tolerance: float) -> TipPath:
-    """Take the path of a motion, and leave its timing and its rests.
+def paths_of(trajectory: Trajectory, duration: float, tolerance: float) -> list[TipPath]:
+    """Take the path of a motion, and leave its timing and its rests; where it rests in a corner another path begins.
 
     Parameters
     ----------
@@ -64,10 +66,12 @@ def path_of(trajectory: Trajectory, duration: float, tolerance: float) -> TipPat
     Raises
     ------
     ModelError
-        The tip does not move, or the path has a corner.
+        The tip does not move, or it does not rest in a corner of its path.
     """
+    points, velocities = np.moveaxis(sampled(trajectory, np.linspace(0.0, duration, _SAMPLES))[:, :2], 1, 0)
+    ends = [0, *_corners(points, np.linalg.norm(velocities, axis=1)), _SAMPLES - 1]
     try:
-        return path_through(sampled(trajectory, np.linspace(0.0, duration, _SAMPLES))[:, 0], tolerance)
+        return [path_through(points[first : last + 1], tolerance) for first, last in pairwise(ends)]
     except ModelError as error:
         rows = trajectory.path if isinstance(trajectory, Blended) else trajectory
         if not isinstance(rows, Tabulated) or "deviation" not in error.details:
@@ -81,8 +85,27 @@ def path_of(trajectory: Trajectory, duration: float, tolerance: float) -> TipPat
         raise ModelError(said, **error.details) from None
 
 
+def _corners(points: np.ndarray, speeds: np.ndarray) -> list[int]:
+    """Samples at which the tip rests in a corner, or next to its rest there."""
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    moving = np.flatnonzero(lengths > _STILL * lengths.sum())
+    along = steps[moving] / lengths[moving, None]
+    turns = np.arccos(np.clip((along[1:] * along[:-1]).sum(axis=1), -1.0, 1.0))
+    corners: list[int] = []
+    for before, after in zip(moving[:-1][turns > _CORNER], moving[1:][turns > _CORNER], strict=True):
+        at = int(before + 1 + speeds[before + 1 : after + 1].argmin())
+        if speeds[at] > _AT_REST * speeds.max():
+            continue
+        # The step that cuts a corner turns at both its ends.
+        if corners and before <= corners[-1]:
+            at = min(at, corners.pop(), key=lambda sample: speeds[sample])
+        corners.append(at)
+    return corners
+
+
 def path_through(points: np.ndarray, tolerance: float) -> TipPath:
-    """Fit a path to points that lie close together; see `path_of`.
+    """Fit a path to points that lie close together; see `paths_of`.
 
     Parameters
     ----------

@@ -10,17 +10,19 @@ import numpy as np
 from tqdm import tqdm
 
 from ...errors import ConvergenceError, InfeasibleError, ModelError, PCRError, checked_number
+from ...loop.references.on_curves import Spline
 from ...loop.scene.scene import Scene
 from .course import paced
 from .fastest import faster
 from .free import Freed, freed, way_points
+from .legs import joined
 from .limits import PlanLimits
 from .meshing import FINE, checked_at, points, repaced, with_points
 from .motion import Carrier
 from .pace import cells_of, spline_of, times
-from .path import TipPath, path_of
+from .path import TipPath, paths_of
 from .rods_mass import asked_of_motors, with_rods
-from .starting import STATICS, evened, started, where
+from .starting import STATICS, evened, resting, started, where
 from .timed_path import Paced, RodsMass, TimedPath
 from .timing import EXACT, NEAR, Problem, Timing
 
@@ -48,7 +50,8 @@ def plan_timing(
 
     The path is a spline of the tip, its timing that of the reference no more. Motor angles follow from inverse
     statics with the force that the motion takes, F = m (g - a) - c v: rates hold the path's third derivative in time,
-    their change the fourth. The tip starts and ends at rest, with continuous acceleration and jerk.
+    their change the fourth. The tip starts and ends at rest, with continuous acceleration and jerk; so
+    it does in corners of the path, if the reference rests there too.
 
     Parameters
     ----------
@@ -59,7 +62,7 @@ def plan_timing(
     tolerance : float
         Greatest distance between the reference's path and the planned one [m].
     cells : int, optional
-        Pieces of the timing. None: of 10 ms each, at least 80 and at most 240.
+        Pieces of the timing, from rest to rest. None: of 10 ms each, at least 80 and at most 240.
     free : bool
         Whether the path between the reference's way-points is free too; it is found from the plan of the given one.
     progress : bool
@@ -72,7 +75,7 @@ def plan_timing(
     Raises
     ------
     ModelError
-        The scene has no path to plan, or one with a corner.
+        The scene has no path to plan, or one with a corner in which the reference does not rest.
     UnreachableError, UnstableError, ConvergenceError
         The robot cannot rest at some point of the path; the message says where.
     InfeasibleError
@@ -96,9 +99,12 @@ def plan_timing(
         raise ModelError(f"{scene.name}: has no reference, and so no path to plan", key="reference")
     checked_number("tolerance", tolerance, above=0.0)
     limits = PlanLimits.of_scene(scene) if limits is None else limits
-    points_between = way_points(scene.trajectory) if free else np.empty((0, 2))
     span = _span(scene)
-    path = path_of(scene.trajectory, span, tolerance)
+    paths = given = paths_of(scene.trajectory, span, tolerance)
+    freely = (way_points(scene.trajectory), given) if free else None
+    if freely is not None and len(given) > 1:  # a free path has no corners: it is found from a smooth one
+        smooth = Spline(tuple(map(tuple, freely[0].tolist())), speed=1.0)
+        paths = paths_of(smooth, smooth.duration, tolerance)
     carrier = carrier_of(scene, span)
     with tqdm(disable=not progress, unit=" iterations", desc="planning", leave=False) as bar:
 
@@ -107,9 +113,14 @@ def plan_timing(
             bar.update()
 
         def planned_for(kept: PlanLimits) -> TimedPath:
-            _require_region(scene, kept, path)
-            problem = Problem(paced(path), scene.start(), carrier, kept)
-            return _planned(scene.name, problem, path, cells, points_between if free else None, told)
+            legs, pose = [], scene.start()
+            for path in paths:
+                _require_region(scene, kept, path)
+                problem = Problem(paced(path), pose, carrier, kept)
+                legs.append(_planned(scene.name, problem, path, cells, freely, told))
+                if path is not paths[-1]:
+                    pose = resting(problem, path)[-1]
+            return joined(legs)
 
         return with_rods(scene, limits, carrier.mass - scene.robot.tip_mass, planned_for)
 
@@ -140,10 +151,10 @@ def _planned(
     problem: Problem,
     path: TipPath,
     cells: int | None,
-    points_between: np.ndarray | None,
+    freely: tuple[np.ndarray, list[TipPath]] | None,
     told: Callable[[float], None],
 ) -> TimedPath:
-    """For rods without mass; between way-points freely, if they are given."""
+    """For rods without mass; freely between way-points, if these and the paths that were given are."""
     iterations = 0
 
     def counted(seconds: float) -> None:
@@ -155,9 +166,9 @@ def _planned(
     wanted = cells or int(np.clip(math.ceil(timing.duration / _CELL), _FEWEST, _MOST))
     timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
     timing = faster(timing, most=_ITERATIONS[1], allowed=_ALLOWED, tolerance=_GAINS[1], told=counted)
-    if points_between is not None:
-        found = freed(timing, points_between, wanted, _ALLOWED)
-        return _free_result(name, found, path, problem.limits, iterations + found.iterations)
+    if freely is not None:
+        found = freed(timing, freely[0], wanted, _ALLOWED)
+        return _free_result(name, found, freely[1], problem.limits, iterations + found.iterations)
     timing, fine = refined(timing, counted)
     return _result(name, timing, fine, path.deviation, iterations)
 
@@ -245,10 +256,11 @@ def _require_region(scene: Scene, limits: PlanLimits, path: TipPath) -> None:
             raise type(error)(f"{where(length, at_point)}: {error}", **error.details, s=float(length)) from None
 
 
-def _distance(path: TipPath, tips: np.ndarray) -> float:
-    """Largest distance of points from a path [m]."""
-    given = path.derivatives(np.linspace(0.0, path.length, 2001))[0]
-    return max(float(np.linalg.norm(given - p, axis=1).min()) for p in tips)
+def _distance(paths: list[TipPath], tips: np.ndarray) -> float:
+    """Largest distance of tips from a motion whose path is given [m]."""
+    given = np.concatenate([path.derivatives(np.linspace(0.0, path.length, 2001))[0] for path in paths])
+    away = max(float(np.linalg.norm(given - p, axis=1).min()) for p in tips)
+    return away + max(path.deviation for path in paths)
 
 
 def _result(name: str, timing: Timing, fine: Timing, deviation: float, iterations: int) -> TimedPath:
@@ -270,13 +282,13 @@ def _result(name: str, timing: Timing, fine: Timing, deviation: float, iteration
     )
 
 
-def _free_result(name: str, found: Freed, path: TipPath, limits: PlanLimits, iterations: int) -> TimedPath:
+def _free_result(name: str, found: Freed, given: list[TipPath], limits: PlanLimits, iterations: int) -> TimedPath:
     asked = found.asked
     return TimedPath(
         name,
         found.move,
         limits,
-        path.deviation + _distance(path, asked.p),
+        _distance(given, asked.p),
         found.grid,
         t=found.t,
         s=_lengths(asked.p),

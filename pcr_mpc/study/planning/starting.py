@@ -62,7 +62,7 @@ def _spread(values: np.ndarray, width: int) -> np.ndarray:
 def started(problem: Problem, path: TipPath) -> Timing:
     """A pace that the robot can keep."""
     x = points(_ROUGH_CELLS, 2)
-    q = _resting(problem, path, x)
+    q = _angles_at_rest(problem, path, x)
     acceleration = 5.0 * problem.pose.robot.force_scale / problem.carrier.mass
     # The polynomial of degree 7 has a largest acceleration of 7.5 length / duration^2.
     seconds = math.sqrt(7.5 * path.length / acceleration)
@@ -114,21 +114,26 @@ def _slower(timing: Timing) -> float:
     return float(max((shares[kind] / _AIM) ** (1.0 / power) for kind, power in _POWERS.items() if kind in shares))
 
 
-def _resting(problem: Problem, path: TipPath, x: np.ndarray) -> np.ndarray:
-    """Motor angles that hold the tip on the path at the points x."""
+def resting(problem: Problem, path: TipPath) -> list[Equilibrium]:
+    """Poses at rest along a path, in equal steps of its length."""
     s = np.linspace(0.0, path.length, STATICS)
-    p = path.derivatives(s)[0]
     pose: Equilibrium = problem.pose
     payload = problem.carrier.weight - pose.robot.tip_weight
     found = []
-    for length, tip in zip(s, p, strict=True):
+    for length, tip in zip(s, path.derivatives(s)[0], strict=True):
         try:
             pose = inverse_statics(pose.robot, tip, payload, guess=pose)
         except PCRError as error:
             raise type(error)(f"{where(length, tip)}: {error}", **error.details, s=float(length)) from None
-        found.append(pose.q)
-    course = problem.course
-    return np.asarray(CubicSpline(s, np.array(found))(np.clip(course.nominal(x), 0.0, path.length)))
+        found.append(pose)
+    return found
+
+
+def _angles_at_rest(problem: Problem, path: TipPath, x: np.ndarray) -> np.ndarray:
+    """Motor angles that hold the tip on the path at the points x."""
+    q = np.array([pose.q for pose in resting(problem, path)])
+    s = np.clip(problem.course.nominal(x), 0.0, path.length)
+    return np.asarray(CubicSpline(np.linspace(0.0, path.length, STATICS), q)(s))
 
 
 def _require_rest(still: Timing, path: TipPath) -> None:

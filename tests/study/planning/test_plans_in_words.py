@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from pcr_mpc import (
@@ -25,7 +26,7 @@ from pcr_mpc.linearisation.pose_limits import PoseLimits
 from pcr_mpc.loop.references.tabulated import Tabulated
 from pcr_mpc.loop.references.trajectory import PickAndPlace
 from pcr_mpc.report.designs.plan_table import plan_table
-from pcr_mpc.study.planning.path import path_of
+from pcr_mpc.study.planning.path import paths_of
 from tests.conftest import MODELS
 from tests.references.drawn import rows
 
@@ -43,10 +44,26 @@ def test_a_rough_path_is_told_from_one_with_a_corner(scene):
     t, points = rows()
     rough = Tabulated(t, points)
     with pytest.raises(ModelError, match=rf"rough.* scatter by about .* smoothing = {rough.scatter:.2g}$"):
-        path_of(Blended(rough), t[-1], 5e-5)
-    path_of(Blended(replace(rough, smoothing=rough.scatter)), t[-1], 5e-5)
+        paths_of(Blended(rough), t[-1], 5e-5)
+    paths_of(Blended(replace(rough, smoothing=rough.scatter)), t[-1], 5e-5)
+
+
+def test_a_corner_wants_a_rest():
+    """Without one no time is enough; with one the path has two legs, which meet in it."""
+
+    def round_the_corner(t):
+        way = np.stack([np.minimum(t, 0.1), 0.2 + np.maximum(t - 0.1, 0.0)], axis=1)
+        rate = np.stack([t < 0.1, t >= 0.1], axis=1).astype(float)
+        return np.stack([way, rate, np.zeros_like(way)], axis=1)
+
     with pytest.raises(ModelError, match=r"round the corner, or allow more \(--tolerance, tolerance\)$"):
-        path_of(Waypoints(((0.0, 0.2), (0.1, 0.2), (0.1, 0.3)), speed=0.1), 4.0, 5e-5)
+        paths_of(round_the_corner, 0.2, 1e-5)
+    first, second = paths_of(Waypoints(((0.0, 0.2), (0.1, 0.2), (0.1, 0.3)), speed=0.1), 4.0, 5e-5)
+    assert first.length == pytest.approx(0.1, abs=1e-9)
+    assert first.derivatives(np.array([first.length]))[0, 0] == pytest.approx([0.1, 0.2], abs=1e-9)
+    assert second.derivatives(np.zeros(1))[0, 0] == pytest.approx([0.1, 0.2], abs=1e-9)
+    # Points in line are no corner: the tip need not rest there.
+    assert len(paths_of(Waypoints(((0.0, 0.2), (0.05, 0.2), (0.1, 0.2)), speed=0.1), 4.0, 5e-5)) == 1
 
 
 @pytest.mark.parametrize(

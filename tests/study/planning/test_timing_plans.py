@@ -21,7 +21,7 @@ from pcr_mpc.study.planning.course import paced
 from pcr_mpc.study.planning.meshing import points
 from pcr_mpc.study.planning.motion import Carrier
 from pcr_mpc.study.planning.pace import constant_pace, spline_of
-from pcr_mpc.study.planning.path import path_of
+from pcr_mpc.study.planning.path import paths_of
 from pcr_mpc.study.planning.timing import Problem, evaluated
 from tests.study.planning.by_statics import motors
 
@@ -169,7 +169,7 @@ def test_it_is_as_fast_as_toppra_where_only_rates_and_accelerations_count(light)
 def test_slopes_are_those_of_differences(scene, pair):
     """Of every limit's share, by the coefficients of the pace."""
     rng = np.random.default_rng(0)
-    path = path_of(scene.trajectory, 0.8, 5e-5)
+    (path,) = paths_of(scene.trajectory, 0.8, 5e-5)
     limits = replace(PlanLimits.of_scene(scene), tip_speed=1.0, tip_acceleration=5.0, tip_jerk=200.0)
     limits = replace(limits, stiffness=50.0, rod_margin=0.38)  # so near that their slopes are computed
     problem = Problem(paced(path), scene.start(), Carrier(pair.tip_mass, pair.drag, np.zeros(2)), limits)
