@@ -10,6 +10,7 @@ from scipy import sparse
 from scipy.interpolate import CubicSpline
 from scipy.sparse.linalg import spsolve
 
+from ...errors import PCRError
 from .pace import constant_pace, duration, spline_of, times, unit_splines
 from .timing import Timing, evaluated
 
@@ -22,6 +23,7 @@ _SAMPLES = 4001
 _NEAR_REST = 1e-3  # of the largest speed, below which nothing is learnt of the pace
 _SMOOTHING = 1e-3
 _SLOWEST = 0.05  # of the mean b
+_SLOWER = (1.0, 1.5, 2.0, 4.0, 8.0)  # times as long
 
 
 class Checked(NamedTuple):
@@ -124,4 +126,11 @@ def repaced(timing: Timing, cells: int, pieces: int) -> Timing:
     grid = points(cells)
     before = np.interp(course.nominal(grid), place, x)
     q = CubicSpline(timing.x, timing.turned.q.value)(before)
-    return evaluated(replace(timing.problem, course=course), pace, grid, q, timing.near(before))
+    problem = replace(timing.problem, course=course)
+    # At the same pace, all but: where that is too fast for the rods, more slowly.
+    for slower in _SLOWER[:-1]:
+        try:
+            return evaluated(problem, spline_of(slower**-2.0 * pace.c), grid, q, timing.near(before))
+        except PCRError:
+            continue
+    return evaluated(problem, spline_of(_SLOWER[-1] ** -2.0 * pace.c), grid, q, timing.near(before))

@@ -21,10 +21,13 @@ from ...loop.references.trajectory import Trajectory, sampled
 
 _DEGREE = 7  # a motor's acceleration holds the fourth derivative, which is to have no kinks
 _SAMPLES = 4001  # of the motion whose path is taken
-_FEWEST, _MOST = 8, 1024  # pieces of the spline
+_FEWEST, _MOST = 8, 512  # pieces of the spline, alike; where the path turns sharply there may be as many again
+_POINTS_OF_TWO = 8
+_FEW = 0.125  # of all pieces, or samples
 _SPARE = 0.1  # of the tolerance, which a plain fit may use
 _PENALTIES, _BISECTIONS = (1e-30, 1e-8), 14  # to one part in a hundred
 _STILL = 1e-9  # of the path's length: a step between samples that is none
+_SHARP, _CLOSER = 0.05, 3  # turn from step to step beyond which samples are taken closer [rad]; how often
 _CORNER, _AT_REST = 0.02, 1e-2  # turn from step to step where the tip rests [rad]; share of its largest speed
 
 
@@ -68,12 +71,13 @@ def paths_of(trajectory: Trajectory, duration: float, tolerance: float) -> list[
     ModelError
         The tip does not move, or it does not rest in a corner of its path.
     """
-    points, velocities = np.moveaxis(sampled(trajectory, np.linspace(0.0, duration, _SAMPLES))[:, :2], 1, 0)
-    ends = [0, *_corners(points, np.linalg.norm(velocities, axis=1)), _SAMPLES - 1]
+    points, speeds = _sampled(trajectory, duration)
+    ends = [0, *_corners(points, speeds), len(points) - 1]
+    rows = trajectory.path if isinstance(trajectory, Blended) else trajectory
+    measured = isinstance(rows, Tabulated)  # what turns sharply in a file may be noise
     try:
-        return [path_through(points[first : last + 1], tolerance) for first, last in pairwise(ends)]
+        return [path_through(points[first : last + 1], tolerance, sharp=not measured) for first, last in pairwise(ends)]
     except ModelError as error:
-        rows = trajectory.path if isinstance(trajectory, Blended) else trajectory
         if not isinstance(rows, Tabulated) or "deviation" not in error.details:
             raise
         said = (
@@ -85,13 +89,33 @@ def paths_of(trajectory: Trajectory, duration: float, tolerance: float) -> list[
         raise ModelError(said, **error.details) from None
 
 
-def _corners(points: np.ndarray, speeds: np.ndarray) -> list[int]:
-    """Samples at which the tip rests in a corner, or next to its rest there."""
+def _sampled(trajectory: Trajectory, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a motion, closer together where its path turns sharply, and the speeds there."""
+    t = np.linspace(0.0, duration, _SAMPLES)
+    for _ in range(_CLOSER):
+        samples = sampled(trajectory, t)
+        moving, turns = _turns(samples[:, 0])
+        sharp = np.unique(np.concatenate([moving[:-1][turns > _SHARP], moving[1:][turns > _SHARP]]))
+        if not 0 < sharp.size < _FEW * len(t):
+            break
+        between = t[sharp, None] + (t[sharp + 1] - t[sharp])[:, None] * np.array([0.25, 0.5, 0.75])
+        t = np.sort(np.concatenate([t, between.ravel()]))
+    samples = sampled(trajectory, t)
+    return samples[:, 0], np.linalg.norm(samples[:, 1], axis=1)
+
+
+def _turns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Steps from point to point that are any, shape (K,), and the angles from each to the next, (K - 1,) [rad]."""
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     moving = np.flatnonzero(lengths > _STILL * lengths.sum())
     along = steps[moving] / lengths[moving, None]
-    turns = np.arccos(np.clip((along[1:] * along[:-1]).sum(axis=1), -1.0, 1.0))
+    return moving, np.arccos(np.clip((along[1:] * along[:-1]).sum(axis=1), -1.0, 1.0))
+
+
+def _corners(points: np.ndarray, speeds: np.ndarray) -> list[int]:
+    """Samples at which the tip rests in a corner, or next to its rest there."""
+    moving, turns = _turns(points)
     corners: list[int] = []
     for before, after in zip(moving[:-1][turns > _CORNER], moving[1:][turns > _CORNER], strict=True):
         at = int(before + 1 + speeds[before + 1 : after + 1].argmin())
@@ -104,7 +128,7 @@ def _corners(points: np.ndarray, speeds: np.ndarray) -> list[int]:
     return corners
 
 
-def path_through(points: np.ndarray, tolerance: float) -> TipPath:
+def path_through(points: np.ndarray, tolerance: float, *, sharp: bool = False) -> TipPath:
     """Fit a path to points that lie close together; see `paths_of`.
 
     Parameters
@@ -113,6 +137,8 @@ def path_through(points: np.ndarray, tolerance: float) -> TipPath:
         [m].
     tolerance : float
         [m].
+    sharp : bool
+        Whether they may turn sharply in some places.
     """
     points = checked_array("points", points, (len(points), 2))
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -125,7 +151,7 @@ def path_through(points: np.ndarray, tolerance: float) -> TipPath:
     moving = np.concatenate([[True], steps > _STILL * steps.sum()])
     points = np.vstack([points[moving][:-1], points[-1]])
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    spline, away = _smoothest(s, points, tolerance)
+    spline, away = _smoothest(s, points, tolerance, sharp)
     at = int(away.argmax())
     if away[at] <= tolerance:
         return TipPath(spline, float(s[-1]), float(away[at]))
@@ -139,18 +165,25 @@ def path_through(points: np.ndarray, tolerance: float) -> TipPath:
     )
 
 
-def _smoothest(s: np.ndarray, points: np.ndarray, tolerance: float) -> tuple[BSpline, np.ndarray]:
+def _smoothest(s: np.ndarray, points: np.ndarray, tolerance: float, sharp: bool) -> tuple[BSpline, np.ndarray]:
     """Spline of least fourth derivative that stays within the tolerance of points, and its distances from them.
 
     A change of a motor's rate holds that derivative: what is left of the tolerance is used to make it small.
     """
-    pieces = _FEWEST
+    breaks, most = np.linspace(0.0, s[-1], _FEWEST + 1), min(_MOST, len(s) // 4)
     while True:
-        fit = _Fit(s, points, np.linspace(0.0, s[-1], pieces + 1))
+        fit = _Fit(s, points, breaks)
         spline, away = fit(0.0)
-        if away.max() <= _SPARE * tolerance or 2 * pieces > min(_MOST, len(s) // 4):
-            break
-        pieces *= 2
+        pieces = len(breaks) - 1
+        halves = np.ones(pieces, dtype=bool)
+        if 2 * pieces <= most:
+            if away.max() <= _SPARE * tolerance:
+                break
+        else:  # no more everywhere, but where it is needed
+            halves = _poor(s, away, breaks, tolerance)
+            if not sharp or not 0 < halves.sum() < _FEW * most:
+                break
+        breaks = np.sort(np.concatenate([breaks, (breaks[:-1] + breaks[1:])[halves] / 2]))
     low, high = _PENALTIES
     for _ in range(_BISECTIONS if away.max() <= tolerance else 0):
         middle = math.sqrt(low * high)
@@ -160,6 +193,16 @@ def _smoothest(s: np.ndarray, points: np.ndarray, tolerance: float) -> tuple[BSp
         else:
             high = middle
     return spline, away
+
+
+def _poor(s: np.ndarray, away: np.ndarray, breaks: np.ndarray, tolerance: float) -> np.ndarray:
+    """Which pieces of a spline are too far from the points at s, or next to one that is, and have points for two."""
+    pieces = len(breaks) - 1
+    which = np.clip(np.searchsorted(breaks, s, side="right") - 1, 0, pieces - 1)
+    poor = np.bincount(which[away > tolerance], minlength=pieces) > 0
+    poor[1:] |= poor[:-1].copy()
+    poor[:-1] |= poor[1:].copy()
+    return np.asarray(poor & (np.bincount(which, minlength=pieces) >= _POINTS_OF_TWO))
 
 
 class _Fit:
@@ -189,8 +232,11 @@ class _Fit:
     def _roughness(self) -> tuple[Any, np.ndarray]:
         """Gram matrix of fourth derivatives, at more points than the spline has freedom, and its right-hand side."""
         count, length = self._design.shape[1], self._s[-1]
-        units, pieces = BSpline(self._knots, np.eye(count), _DEGREE), count - _DEGREE
-        bend = sparse.csc_array(units(np.linspace(0.0, length, 2 * pieces + 2), nu=4) * length**4 / (pieces + 1))
+        units, breaks = BSpline(self._knots, np.eye(count), _DEGREE), self._knots[_DEGREE:-_DEGREE]
+        pieces = np.diff(breaks)
+        at = np.concatenate([breaks[:-1] + share * pieces for share in (0.25, 0.75)])
+        weights = np.sqrt(np.tile(pieces, 2) / (2.0 * length))
+        bend = sparse.csc_array(units(at, nu=4) * length**4 * weights[:, None])
         inner = bend[:, 1:-1]
         return inner.T @ inner, -(inner.T @ (bend[:, [0, count - 1]] @ self._ends))
 

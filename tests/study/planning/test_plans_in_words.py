@@ -48,8 +48,8 @@ def test_a_rough_path_is_told_from_one_with_a_corner(scene):
     paths_of(Blended(replace(rough, smoothing=rough.scatter)), t[-1], 5e-5)
 
 
-def test_a_corner_wants_a_rest():
-    """Without one no time is enough; with one the path has two legs, which meet in it."""
+def test_a_corner_wants_a_rest_or_is_rounded():
+    """Without a rest it is rounded within the tolerance, if that can be; with one the path has two legs that meet."""
 
     def round_the_corner(t):
         way = np.stack([np.minimum(t, 0.1), 0.2 + np.maximum(t - 0.1, 0.0)], axis=1)
@@ -57,7 +57,10 @@ def test_a_corner_wants_a_rest():
         return np.stack([way, rate, np.zeros_like(way)], axis=1)
 
     with pytest.raises(ModelError, match=r"round the corner, or allow more \(--tolerance, tolerance\)$"):
-        paths_of(round_the_corner, 0.2, 1e-5)
+        paths_of(round_the_corner, 0.2, 1e-9)
+    (rounded,) = paths_of(round_the_corner, 0.2, 5e-5)
+    away = np.linalg.norm(rounded.derivatives(np.linspace(0.0, rounded.length, 10001))[0] - [0.1, 0.2], axis=1).min()
+    assert 1e-6 < away < 5e-5
     first, second = paths_of(Waypoints(((0.0, 0.2), (0.1, 0.2), (0.1, 0.3)), speed=0.1), 4.0, 5e-5)
     assert first.length == pytest.approx(0.1, abs=1e-9)
     assert first.derivatives(np.array([first.length]))[0, 0] == pytest.approx([0.1, 0.2], abs=1e-9)

@@ -68,6 +68,24 @@ def test_a_free_path_has_no_corner(scene, planned):
     assert free.deviation == pytest.approx(away, rel=1e-2)
 
 
+@pytest.mark.slow
+def test_a_sharp_bend_is_rounded_within_the_tolerance(scene):
+    """A cubic spline through points that all but turn back bends with a radius of a tenth of a millimetre."""
+    points = ((-0.06, 0.22), (0.0, 0.26), (-0.02, 0.247), (0.05, 0.24))
+    sharp = replace(scene, trajectory=Blended(Spline(points, speed=0.1)))
+    t = np.linspace(0.0, sharp.trajectory.duration, 200001)
+    way, rate, change = np.moveaxis(sharp.trajectory(t), 1, 0)
+    bend = np.abs(rate[:, 0] * change[:, 1] - rate[:, 1] * change[:, 0])[1:-1]
+    radius = (np.linalg.norm(rate, axis=1)[1:-1] ** 3 / np.maximum(bend, 1e-300)).min()
+    assert radius < 1e-3
+    planned = plan_timing(sharp, cells=60)
+    away = [np.linalg.norm(way - p, axis=1).min() for p in planned(np.linspace(0.0, planned.duration, 200))[:, 0]]
+    assert max(away) < planned.deviation + 1e-6
+    assert planned.deviation <= 5e-5
+    assert planned.excess <= 1e-3
+    assert np.linalg.norm(planned.motion[10:-10, 1], axis=1).min() < 0.2 * np.linalg.norm(planned.motion[:, 1]).max()
+
+
 def _from_way(p, first, last):
     along = np.clip((p - first) @ (last - first) / ((last - first) @ (last - first)), 0.0, 1.0)
     return np.linalg.norm(p - first - along * (last - first))
