@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import linprog
 
 from pcr_mpc import ConvergenceError
-from pcr_mpc.study.planning.program import LinearProgram
+from pcr_mpc.study.planning.along_path.program import LinearProgram
 
 
 def test_a_program_that_grows_has_the_optimum_of_one_solved_anew(capfd):

@@ -9,32 +9,29 @@ from dataclasses import replace
 import numpy as np
 from tqdm import tqdm
 
-from ...errors import ConvergenceError, InfeasibleError, ModelError, PCRError, checked_number
+from ...errors import InfeasibleError, ModelError, PCRError, checked_number
 from ...loop.references.on_curves import Spline
 from ...loop.scene.scene import Scene
-from .course import paced
-from .fastest import faster
-from .free import Freed, freed, way_points
-from .legs import joined
+from .along_path.course import paced
+from .along_path.fastest import faster
+from .along_path.legs import joined
+from .along_path.meshing import repaced
+from .along_path.pace import spline_of, times
+from .along_path.path import TipPath, paths_of
+from .along_path.refining import ALLOWED, refined
+from .along_path.starting import STATICS, evened, resting, started, where
+from .along_path.timing import Problem, Timing
+from .freely.free import Freed, freed, way_points
 from .limits import PlanLimits
-from .meshing import FINE, checked_at, points, repaced, with_points
 from .motion import Carrier
-from .pace import cells_of, spline_of, times
-from .path import TipPath, paths_of
 from .rods_mass import asked_of_motors, with_rods
-from .starting import STATICS, evened, resting, started, where
 from .timed_path import Paced, RodsMass, TimedPath
-from .timing import EXACT, NEAR, Problem, Timing
 
 _CELL = 1e-2  # s
 _FEWEST, _MOST = 80, 240  # cells
 _CELLS_PER_PIECE = 5
-_ITERATIONS = (40, 12, 6)
+_ITERATIONS = (40, 12)
 _GAINS = (1e-2, 1e-3)  # of the duration, that are none: roughly, and in the end
-_ALLOWED = 1.0 - 5e-4  # share of the limits that is used, so that they are kept between the points too
-_EXCESS = 1e-4  # over 1, on the fine grid, at which no more points are added
-_LARGEST_EXCESS = 1e-3
-_ROUNDS = 14
 
 
 def plan_timing(
@@ -165,9 +162,9 @@ def _planned(
     timing = faster(evened(started(problem, path)), most=_ITERATIONS[0], tolerance=_GAINS[0], told=counted)
     wanted = cells or int(np.clip(math.ceil(timing.duration / _CELL), _FEWEST, _MOST))
     timing = repaced(timing, wanted, max(8, wanted // _CELLS_PER_PIECE))
-    timing = faster(timing, most=_ITERATIONS[1], allowed=_ALLOWED, tolerance=_GAINS[1], told=counted)
+    timing = faster(timing, most=_ITERATIONS[1], allowed=ALLOWED, tolerance=_GAINS[1], told=counted)
     if freely is not None:
-        found = freed(timing, freely[0], wanted, _ALLOWED)
+        found = freed(timing, freely[0], wanted, ALLOWED)
         return _free_result(name, found, freely[1], problem.limits, iterations + found.iterations)
     timing, fine = refined(timing, counted)
     return _result(name, timing, fine, path.deviation, iterations)
@@ -189,48 +186,6 @@ def carrier_of(scene: Scene, span: float) -> Carrier:
             )
     mass = scene.robot.tip_mass + float(carried[0])
     return Carrier(mass, scene.robot.drag, mass * np.array(scene.robot.gravity))
-
-
-def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tuple[Timing, Timing]:
-    """Add points where limits are exceeded between the points, until they are kept on a grid ten times as fine.
-
-    Returns
-    -------
-    timing, fine : Timing
-        At the points where its limits were kept, and on the fine grid.
-
-    Raises
-    ------
-    ConvergenceError
-        They are not kept to a thousandth.
-    """
-    per_cell = FINE // 3  # which finds most
-    between, tolerance = points(cells_of(timing.pace), per_cell), NEAR
-    for _ in range(_ROUNDS):
-        fine, checked = checked_at(timing, between, tolerance, suspect=1.0 + _EXCESS)
-        if checked.worst <= 1.0 + _EXCESS:
-            if tolerance == EXACT:
-                return timing, fine
-            if per_cell == FINE:
-                tolerance = EXACT
-            per_cell, between = FINE, points(cells_of(timing.pace), FINE)
-            continue
-        x = with_points(timing.x, checked, _ALLOWED)
-        more = faster(timing.at(x), most=_ITERATIONS[2], trust=0.1, allowed=_ALLOWED, tolerance=_GAINS[1], told=told)
-        if more.pace is timing.pace and len(x) == len(timing.x):
-            break
-        timing, tolerance = more, NEAR
-    if checked.worst > 1.0 + _LARGEST_EXCESS:
-        limit, at = np.unravel_index(int(checked.shares.argmax()), checked.shares.shape)
-        raise ConvergenceError(
-            f"the plan still exceeds the limit on {fine.uses[limit].limit} by {100 * (checked.worst - 1):.3g} % at "
-            f"{times(fine.pace, checked.x)[at]:.4f} s after {_ROUNDS} refinements; take more cells than "
-            f"{cells_of(fine.pace)}",
-            residual=checked.worst - 1.0,
-            iterations=_ROUNDS,
-            last=fine.pace.c,
-        )
-    return timing, fine
 
 
 def _require_region(scene: Scene, limits: PlanLimits, path: TipPath) -> None:

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from ...frozen import Frozen
-from .course import PacedPath
+from .along_path.course import PacedPath
+from .along_path.pace import cells_of, duration, places, times
 from .limits import UNITS, PlanLimits
-from .pace import cells_of, duration, places, times
 
 ACTIVE = 0.95  # share of a limit from which on it acts
 _HEADER = "t_s,x_m,y_m,vx_m_s,vy_m_s,ax_m_s2,ay_m_s2"

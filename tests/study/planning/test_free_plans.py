@@ -18,7 +18,7 @@ from pcr_mpc import (
     simulate,
 )
 from pcr_mpc.loop.demand.feasibility import reference_demand, reference_of
-from pcr_mpc.study.planning.free import way_points
+from pcr_mpc.study.planning.freely.free import way_points
 from tests.conftest import MODELS
 
 

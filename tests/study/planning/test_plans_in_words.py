@@ -26,7 +26,7 @@ from pcr_mpc.linearisation.pose_limits import PoseLimits
 from pcr_mpc.loop.references.tabulated import Tabulated
 from pcr_mpc.loop.references.trajectory import PickAndPlace
 from pcr_mpc.report.designs.plan_table import plan_table
-from pcr_mpc.study.planning.path import paths_of
+from pcr_mpc.study.planning.along_path.path import paths_of
 from tests.conftest import MODELS
 from tests.references.drawn import rows
 

@@ -16,13 +16,13 @@ from pcr_mpc import (
     simulate,
 )
 from pcr_mpc.loop.references.trajectory import smooth_step
-from pcr_mpc.study.planning.collocation import _narrowed
-from pcr_mpc.study.planning.course import paced
-from pcr_mpc.study.planning.meshing import points
+from pcr_mpc.study.planning.along_path.course import paced
+from pcr_mpc.study.planning.along_path.meshing import points
+from pcr_mpc.study.planning.along_path.pace import constant_pace, spline_of
+from pcr_mpc.study.planning.along_path.path import paths_of
+from pcr_mpc.study.planning.along_path.timing import Problem, evaluated
+from pcr_mpc.study.planning.freely.collocation import _narrowed
 from pcr_mpc.study.planning.motion import Carrier
-from pcr_mpc.study.planning.pace import constant_pace, spline_of
-from pcr_mpc.study.planning.path import paths_of
-from pcr_mpc.study.planning.timing import Problem, evaluated
 from tests.study.planning.by_statics import motors
 
 NO_MOTORS = {"rate": 1e6, "acceleration": 1e12, "torque": 1e3}

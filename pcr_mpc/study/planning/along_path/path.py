@@ -13,11 +13,11 @@ from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.sparse.linalg import splu
 
-from ...errors import ModelError, cause, checked_array
-from ...frozen import Frozen
-from ...loop.references.blended import Blended
-from ...loop.references.tabulated import Tabulated
-from ...loop.references.trajectory import Trajectory, sampled
+from ....errors import ModelError, cause, checked_array
+from ....frozen import Frozen
+from ....loop.references.blended import Blended
+from ....loop.references.tabulated import Tabulated
+from ....loop.references.trajectory import Trajectory, sampled
 
 _DEGREE = 7  # a motor's acceleration holds the fourth derivative, which is to have no kinks
 _SAMPLES = 4001  # of the motion whose path is taken

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
 
-from ...errors import ConvergenceError, InfeasibleError, PCRError
-from ...plant.statics.equilibrium import Equilibrium
-from ...plant.statics.free_tip import inverse_statics
+from ....errors import ConvergenceError, InfeasibleError, PCRError
+from ....plant.statics.equilibrium import Equilibrium
+from ....plant.statics.free_tip import inverse_statics
 from .meshing import points
 from .pace import cells_of, constant_pace, spline_of
 from .path import TipPath

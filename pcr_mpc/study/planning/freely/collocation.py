@@ -14,12 +14,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...buffered import BUILDING
-from ...control.nonlinear.collocation import gauss_tableau
-from ...errors import InfeasibleError
-from ...plant.rods.closed_form.chart import LEAST_CRITICAL_LOAD
-from ...plant.statics.symbolic import symbolic_statics
-from .timing import Problem
+from ....buffered import BUILDING
+from ....control.nonlinear.collocation import gauss_tableau
+from ....errors import InfeasibleError
+from ....plant.rods.closed_form.chart import LEAST_CRITICAL_LOAD
+from ....plant.statics.symbolic import symbolic_statics
+from ..along_path.timing import Problem
 
 NODES = gauss_tableau(3)[2]
 _POINTS = len(NODES)

@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import BSpline
 
-from ... import interrupt
-from ...errors import PCRError
-from .motion import ORDERS_OF_PACE
+from .... import interrupt
+from ....errors import PCRError
+from ..motion import ORDERS_OF_PACE
 from .pace import local_basis, quadrature, unit_splines
 from .program import LinearProgram
 from .timing import Timing, evaluated

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import sparse
 from scipy.interpolate import CubicSpline
 from scipy.sparse.linalg import spsolve
 
-from ...errors import PCRError
+from ....errors import PCRError
 from .pace import constant_pace, duration, spline_of, times, unit_splines
 from .timing import Timing, evaluated
 
 PER_CELL = 3
 FINE = 10 * PER_CELL  # points to a cell where the result is checked
 _AT_ENDS = 8  # in the first and the last cell: there the tip hardly moves, and b is free to do much
-_APART = 1e-6  # nearer points are the same
 _BY_TIME = 0.8  # of the new course goes by time, the rest as before
 _SAMPLES = 4001
 _NEAR_REST = 1e-3  # of the largest speed, below which nothing is learnt of the pace
@@ -26,69 +25,11 @@ _SLOWEST = 0.05  # of the mean b
 _SLOWER = (1.0, 1.5, 2.0, 4.0, 8.0)  # times as long
 
 
-class Checked(NamedTuple):
-    """Shares of limits, shape (limits, K), at the points x."""
-
-    x: np.ndarray
-    shares: np.ndarray
-
-    @property
-    def worst(self) -> float:
-        """Largest share of any limit."""
-        return float(self.shares.max())
-
-
 def points(cells: int, per_cell: int = PER_CELL) -> np.ndarray:
     """From 0 to 1, more of them at the ends."""
     ends = np.linspace(0.0, 1.0 / cells, max(_AT_ENDS, per_cell), endpoint=False)
     between = np.linspace(1.0 / cells, 1.0 - 1.0 / cells, per_cell * (cells - 2) + 1)
     return np.concatenate([ends, between, 1.0 - ends[::-1]])
-
-
-def checked_at(timing: Timing, x: np.ndarray, tolerance: float, *, suspect: float) -> tuple[Timing, Checked]:
-    """Look at the points x, and at places between them where a share may be larger than what is suspect.
-
-    Returns
-    -------
-    fine : Timing
-        At the points x.
-    checked : Checked
-        At the places too.
-    """
-    fine = timing.at(x, tolerance)
-    places = _tops(x, fine.shares, suspect)
-    if not places.size:
-        return fine, Checked(x, fine.shares)
-    between = fine.at(places, tolerance)
-    order = np.argsort(both := np.concatenate([x, places]), kind="stable")
-    return fine, Checked(both[order], np.concatenate([fine.shares, between.shares], axis=1)[:, order])
-
-
-def _tops(x: np.ndarray, shares: np.ndarray, suspect: float) -> np.ndarray:
-    """Where shares, shape (limits, K), may be largest between the points x: tops of parabolas through three.
-
-    Where a share rises fast and then stays, a parabola is wrong: it says where to look, not what is there.
-    """
-    limit, at = np.nonzero((shares[:, 1:-1] >= shares[:, :-2]) & (shares[:, 1:-1] >= shares[:, 2:]))
-    at += 1
-    before, after, top = x[at] - x[at - 1], x[at + 1] - x[at], shares[limit, at]
-    rise, fall = (top - shares[limit, at - 1]) / before, (top - shares[limit, at + 1]) / after
-    bend, slope = (rise + fall) / (before + after), (rise * after - fall * before) / (before + after)
-    offset = np.divide(slope, 2.0 * bend, out=np.zeros_like(bend), where=bend > 0.0)
-    return np.unique((x[at] + offset)[(top + slope * offset / 2.0 > suspect) & (np.abs(offset) > _APART)])
-
-
-def with_points(x: np.ndarray, checked: Checked, allowed: float) -> np.ndarray:
-    """Add the points at which a limit's share is largest and more than allowed.
-
-    Their neighbours too, to which a peak would move.
-    """
-    fine, shares = checked.x, checked.shares
-    beside = np.pad(shares, ((0, 0), (1, 1)), constant_values=-np.inf)
-    tops = (shares > allowed) & (shares >= beside[:, :-2]) & (shares >= beside[:, 2:])
-    new = fine[np.convolve(tops.any(axis=0), [1, 1, 1], mode="same") > 0]
-    new = new[(np.abs(new[:, None] - x) > _APART).all(axis=1)]
-    return np.sort(np.concatenate([x, new]))
 
 
 def repaced(timing: Timing, cells: int, pieces: int) -> Timing:

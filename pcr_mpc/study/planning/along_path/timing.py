@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline
 
-from ...plant.statics.equilibria import Equilibria
-from ...plant.statics.equilibrium import Equilibrium
-from .angles import Angles, Stand, angles, stood
+from ....plant.statics.equilibria import Equilibria
+from ....plant.statics.equilibrium import Equilibrium
+from ..angles import Angles, Stand, angles, stood
+from ..limits import Asked, PlanLimits, Use, uses
+from ..motion import ORDERS_OF_PACE, Carrier, Motion, motion
 from .course import PacedPath
-from .limits import Asked, PlanLimits, Use, uses
-from .motion import ORDERS_OF_PACE, Carrier, Motion, motion
 from .pace import duration
 
 # Force of the rods that may be missing, in units of sum EI/L^2: on the way, and in the end.

@@ -7,7 +7,7 @@ from typing import Any
 import highspy
 import numpy as np
 
-from ...errors import ConvergenceError
+from ....errors import ConvergenceError
 
 _OPTIONS: dict[str, Any] = {
     "output_flag": False,

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from .timed_path import Move, TimedPath
+from ..timed_path import Move, TimedPath
 
 
 @dataclass(frozen=True, eq=False)

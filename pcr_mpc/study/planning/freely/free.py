@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BPoly, CubicSpline
 
-from ...errors import ConvergenceError, ModelError
-from ...loop.references.blended import Blended
-from ...loop.references.trajectory import PickAndPlace, Trajectory
-from ...plant.rods.physics import require_plain
-from ...plant.statics.symbolic import rod_unknowns
-from .angles import angles, followed, stood
+from ....errors import ConvergenceError, ModelError
+from ....loop.references.blended import Blended
+from ....loop.references.trajectory import PickAndPlace, Trajectory
+from ....plant.rods.physics import require_plain
+from ....plant.statics.symbolic import rod_unknowns
+from ..along_path.pace import times
+from ..along_path.timing import EXACT, Problem, Timing, asked_of
+from ..angles import angles, followed, stood
+from ..limits import Asked, Use, uses
+from ..motion import motion
+from ..timed_path import Move
 from .collocation import NODES, Collocated, solved
-from .limits import Asked, Use, uses
-from .motion import motion
-from .pace import times
-from .timed_path import Move
-from .timing import EXACT, Problem, Timing, asked_of
 
 _MOST_POINTS = 100  # more are samples of a path, and no way-points
 _FEWEST = 4  # intervals from one way-point to the next

@@ -1,0 +1,1 @@
+"""The fastest motion between way-points, whose path is free."""
