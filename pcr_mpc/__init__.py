@@ -53,11 +53,11 @@ if TYPE_CHECKING:
     from .plant.motion.sensitivities import Sensitivities, sensitivities
     from .plant.robot import Robot, load_robot
     from .plant.rod import Rod
-    from .plant.statics.batch import solve_statics_batch
-    from .plant.statics.equilibria import Equilibria
     from .plant.statics.equilibrium import Equilibrium
     from .plant.statics.free_tip import forward_statics, inverse_statics
     from .plant.statics.held_tip import solve_statics
+    from .plant.statics.many_poses.batch import solve_statics_batch
+    from .plant.statics.many_poses.equilibria import Equilibria
     from .plant.statics.stability import Stability, all_equilibria, assess_stability, distance_to_fold
     from .plant.uncertainty import Uncertainty, load_uncertainty
     from .report.plots import animate_run, plot_equilibria, plot_equilibrium, plot_run
@@ -214,7 +214,7 @@ _WHERE = {
     "loop.controller.make_controller": ("make_controller",),
     "loop.references.trajectory": ("Hold", "Lemniscate", "PickAndPlace", "Trajectory"),
     "plant.motion.plant": ("Plant",),
-    "plant.statics.equilibria": ("Equilibria",),
+    "plant.statics.many_poses.equilibria": ("Equilibria",),
     "plant.statics.equilibrium": ("Equilibrium",),
     "plant.statics.free_tip": ("forward_statics", "inverse_statics"),
     "plant.materials": ("MATERIALS", "Material", "Section"),
@@ -224,7 +224,7 @@ _WHERE = {
     "plant.motion.sensitivities": ("Sensitivities", "sensitivities"),
     "plant.statics.stability": ("Stability", "all_equilibria", "assess_stability", "distance_to_fold"),
     "plant.statics.held_tip": ("solve_statics",),
-    "plant.statics.batch": ("solve_statics_batch",),
+    "plant.statics.many_poses.batch": ("solve_statics_batch",),
     "report.plots": ("animate_run", "plot_equilibria", "plot_equilibrium", "plot_run"),
     "report.tables": ("equilibria_table", "equilibrium_table", "summary_table"),
     "plant.uncertainty": ("Uncertainty", "load_uncertainty"),

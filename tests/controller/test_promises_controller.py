@@ -23,7 +23,7 @@ from pcr_mpc.loop.parts.controllers import HoldMotors
 from pcr_mpc.loop.parts.target import MotorTarget
 from pcr_mpc.loop.references.trajectory import PickAndPlace
 from pcr_mpc.loop.scene.settings import Payload
-from pcr_mpc.plant.statics.equilibria import together
+from pcr_mpc.plant.statics.many_poses.equilibria import together
 from tests.conftest import CONTROLLERS, MODELS
 
 PATH = PickAndPlace((-0.06, 0.22), (0.06, 0.22), lift=0.05, wait=0.0, move=0.6)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pcr_mpc.plant.statics.along as along
+import pcr_mpc.plant.statics.many_poses.along as along
 from pcr_mpc import Equilibrium, Robot, inverse_statics, load_robot
 from pcr_mpc.errors import PCRError
-from pcr_mpc.plant.statics.along import inverse_statics_along
+from pcr_mpc.plant.statics.many_poses.along import inverse_statics_along
 from pcr_mpc.plant.statics.margins import largest_strains, least_rod_margins, least_stiffnesses
 from pcr_mpc.plant.statics.stability import least_rod_margin
 

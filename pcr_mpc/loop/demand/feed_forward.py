@@ -17,9 +17,9 @@ from ...plant.motion.mass_matrix import CondensedMass
 from ...plant.motion.plant import Plant
 from ...plant.robot import Robot
 from ...plant.rods.method import closed_form_method
-from ...plant.statics.along import inverse_statics_along
-from ...plant.statics.equilibria import Equilibria
 from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.many_poses.along import inverse_statics_along
+from ...plant.statics.many_poses.equilibria import Equilibria
 from ...plant.statics.margins import largest_strains, least_rod_margins, least_stiffnesses
 from ..references.trajectory import sampled
 from ..scene.scene import Scene

@@ -16,9 +16,9 @@ from ...plant.motion.plant import Plant
 from ...plant.motion.step_graph import LARGEST_DRIFT, StepModel
 from ...plant.robot import Robot
 from ...plant.rods.follower import BRANCH_CHANGE
-from ...plant.statics.along import least_motion
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.free_tip import inverse_statics
+from ...plant.statics.many_poses.along import least_motion
 
 # Rows in one call of a graph: each size is built once.
 BLOCK = 8

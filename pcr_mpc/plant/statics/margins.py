@@ -7,7 +7,7 @@ import numpy as np
 from ..rods.closed_form.chart import LEAST_CRITICAL_LOAD, critical_load
 from ..rods.physics import robot_physics
 from ..rods.strain import largest_moment, largest_strain
-from .equilibria import Equilibria
+from .many_poses.equilibria import Equilibria
 from .stability import NEAR
 
 

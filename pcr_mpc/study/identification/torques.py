@@ -8,8 +8,8 @@ import numpy as np
 
 from ...errors import ConvergenceError
 from ...plant.robot import Robot
-from ...plant.statics.batch import solve_statics_batch
 from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.many_poses.batch import solve_statics_batch
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,9 @@ from scipy.interpolate import make_interp_spline
 
 from ...compiled import has_compiler
 from ...errors import ConvergenceError
-from ...plant.statics.batch import solve_statics_batch
-from ...plant.statics.equilibria import Equilibria
 from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.many_poses.batch import solve_statics_batch
+from ...plant.statics.many_poses.equilibria import Equilibria
 from .linear import Linear
 from .motion import Motion
 

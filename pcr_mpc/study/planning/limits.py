@@ -11,8 +11,8 @@ import numpy as np
 from ...errors import check_numbers
 from ...linearisation.pose_limits import PoseLimits
 from ...loop.scene.scene import Scene
-from ...plant.statics.equilibria import Equilibria
 from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.many_poses.equilibria import Equilibria
 from ...plant.statics.margins import loads
 from .angles import followed
 from .linear import Linear

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline
 
-from ....plant.statics.equilibria import Equilibria
 from ....plant.statics.equilibrium import Equilibrium
+from ....plant.statics.many_poses.equilibria import Equilibria
 from ..angles import Angles, Stand, angles, stood
 from ..limits import Asked, PlanLimits, Use, uses
 from ..motion import ORDERS_OF_PACE, Carrier, Motion, motion

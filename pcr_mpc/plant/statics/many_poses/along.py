@@ -7,19 +7,19 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ... import interrupt
-from ...buffered import BufferedFunction, graph_cache, per_thread
-from ...errors import PCRError, checked_array
-from ..robot import Robot
-from ..rods.follower import BRANCH_CHANGE
-from ..rods.method import RodMethod, warm_step
-from ..rods.numbers import Kind
-from ..rods.physics import robot_layout
+from .... import interrupt
+from ....buffered import BufferedFunction, graph_cache, per_thread
+from ....errors import PCRError, checked_array
+from ...robot import Robot
+from ...rods.follower import BRANCH_CHANGE
+from ...rods.method import RodMethod, warm_step
+from ...rods.numbers import Kind
+from ...rods.physics import robot_layout
+from ..equilibrium import Equilibrium
+from ..first_rung import ROUGH, Climbed, FirstRung
+from ..free_tip import free_solver, inverse_statics
 from .batch import solve_from_records
 from .equilibria import Equilibria, together
-from .equilibrium import Equilibrium
-from .first_rung import ROUGH, Climbed, FirstRung
-from .free_tip import free_solver, inverse_statics
 
 _BLOCK = 64  # poses in one call of the graph
 _TRIALS = 2  # of the motors at each pose: predicted, and corrected once; a last step is not looked at

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...frozen import Frozen
-from ..robot import Robot
-from ..rods.method import TO_NODES, enough_nodes
-from .equilibrium import Equilibrium
-from .state import columns
+from ....frozen import Frozen
+from ...robot import Robot
+from ...rods.method import TO_NODES, enough_nodes
+from ..equilibrium import Equilibrium
+from ..state import columns
 
 _COMMON = (
     "p", "q", "force", "dforce_dp", "dforce_dq", "motor_torque", "dtorque_dq", "energy", "rod_forces", "residual_norm",

@@ -1,27 +1,23 @@
-"""Many held poses in one call: `solve_statics` without Python between the poses."""
+"""Rows of many poses, which fill up as they are solved."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from ... import interrupt
-from ...buffered import BufferedFunction, graph_cache, per_thread
-from ...compiled import compiled as machine_code
-from ...errors import PCRError, checked_vector
-from ..robot import Robot
-from ..rods.follower import BRANCH_CHANGE
-from ..rods.method import RodMethod, for_compiler, warm_calls, warm_step
-from ..rods.numbers import Kind
-from ..rods.physics import robot_layout
+from .... import interrupt
+from ....errors import PCRError, checked_vector
+from ...robot import Robot
+from ...rods.follower import BRANCH_CHANGE
+from ...rods.method import RodMethod
+from ..equilibrium import Equilibrium, moment_units
+from ..first_rung import Climbed
+from ..held_tip import Way
+from ..solver import RodSolver
+from ..state import columns, record_size
 from .equilibria import Equilibria
-from .equilibrium import Equilibrium, moment_units
-from .first_rung import Climbed
-from .held_tip import Way, chosen_way, solver_of
-from .solver import RodSolver
-from .state import columns, record_size
+from .graphs import many, packed
 
 # Poses in one call of a graph: each size is built once, and any number of poses takes few calls.
 _SIZES, _GROWTH = tuple(2**k for k in range(9, -1, -1)), 8
@@ -30,102 +26,7 @@ _LEAST_BLOCK = 32
 _LARGE, _DOUBTFUL = 1e5, 1e-6
 
 
-def solve_statics_batch(
-    robot: Robot,
-    p: Any,
-    q: Any,
-    *,
-    guess: Equilibrium | Equilibria | None = None,
-    along: bool = False,
-    method: str | None = None,
-    segments: int = 8,
-    steps: int | None = None,
-    scheme: str = "rk8",
-    compiled: bool = False,
-) -> Equilibria:
-    """Static equilibria at many held poses: `solve_statics` of each, at hardly more than the cost of its graph.
-
-    Parameters
-    ----------
-    robot : Robot
-    p : array_like, shape (R, 2)
-        Tip positions [m].
-    q : array_like, shape (R, n)
-        Motor angles [rad].
-    guess : Equilibrium or Equilibria, optional
-        Whose branch is followed to each pose; many of the same robot: each from its own. None: on the branch of least
-        energy.
-    along : bool
-        Whether the poses are a path: the branch is followed from each that is solved to the next, from the guess, or
-        from the first pose, solved cold. Otherwise each is followed to from the guess, or solved cold, which is slow.
-    method, segments, steps, scheme
-        See `solve_statics`.
-    compiled : bool
-        As machine code (see `Plant`).
-
-    Returns
-    -------
-    Equilibria
-        A pose that is out of reach or not finite, or to which the rods cannot be followed, is a row of NaN with its
-        reason; a path goes on from the last pose before it.
-
-    Raises
-    ------
-    ValueError
-        Names an argument of the wrong shape or kind.
-    """
-    p, q = _rows("p", p, 2), _rows("q", q, robot.n_rods)
-    if len(p) != len(q):
-        raise ValueError(f"p has {len(p)} rows, q {len(q)}")
-    if isinstance(guess, Equilibria):
-        return _each_from_its_own(robot, p, q, guess, chosen_way(robot, method, segments, steps, scheme), compiled)
-    if guess is not None and not isinstance(guess, Equilibrium):
-        raise TypeError(f"guess is a {type(guess).__name__}, expected an Equilibrium")
-    if guess is not None and guess.robot.n_rods != robot.n_rods:
-        raise ValueError(f"guess has {guess.robot.n_rods} rods, the robot {robot.n_rods}")
-    way = chosen_way(robot, method, segments, steps, scheme)
-    solver = solver_of(robot, way.method, way.shooting)
-    work = _Work(robot, p, q, way, compiled)
-    if isinstance(solver, RodSolver) and (along or guess is not None):
-        work.by_graphs(solver, guess, along=along)
-    else:
-        work.one_by_one(range(len(p)), guess, along=along)
-    return work.result()
-
-
-def solve_from_records(robot: Robot, p: np.ndarray, q: np.ndarray, records: np.ndarray) -> Equilibria:
-    """`solve_statics_batch` by the default method, each from the record of a pose nearby (`Equilibria.records`)."""
-    way = chosen_way(robot, None, 8, None, "rk8")
-    solver = solver_of(robot, way.method, way.shooting)
-    assert isinstance(solver, RodSolver)
-    work = _Work(robot, p, q, way, compiled=False)
-    work.from_records(solver, records)
-    return work.result()
-
-
-def _each_from_its_own(
-    robot: Robot, p: np.ndarray, q: np.ndarray, guess: Equilibria, way: Way, compiled: bool
-) -> Equilibria:
-    solver = solver_of(robot, way.method, way.shooting)
-    same = guess.robot == robot and guess.method == way.method and len(guess.p) == len(p)
-    if not same or not isinstance(solver, RodSolver):
-        raise ValueError(
-            f"guess holds {len(guess.p)} poses of {guess.robot.name} by {guess.method}, expected {len(p)} of "
-            f"{robot.name} by {way.method}, and another method than single_shooting"
-        )
-    work = _Work(robot, p, q, way, compiled)
-    work.from_records(solver, guess.records)
-    return work.result()
-
-
-def _rows(name: str, value: Any, width: int) -> np.ndarray:
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] != width:
-        raise ValueError(f"{name} has shape {array.shape} of {array.dtype}, expected numbers of shape (R, {width})")
-    return np.array(array, dtype=float)
-
-
-class _Work:
+class Rows:
     """Rows that fill up."""
 
     def __init__(self, robot: Robot, p: np.ndarray, q: np.ndarray, way: Way, compiled: bool) -> None:
@@ -151,7 +52,7 @@ class _Work:
         self._recorded = np.zeros(count, dtype=bool)
         self.reasons = [""] * count
         self._wanted = np.full(count, np.inf)  # drift
-        self._kind, self._numbers = _numbers(robot)
+        self._kind, self._numbers = packed(robot)
 
     def result(self) -> Equilibria:
         """All rows."""
@@ -309,7 +210,7 @@ class _Work:
         """Records, verdicts and results of rows (a slice or indices), valid until the next call; starts are records."""
         interrupt.check()
         count = len(self.p[rows])
-        graph = _many(self._kind, method, count, along, self.compiled)
+        graph = many(self._kind, method, count, along, self.compiled)
         start, target, numbers = (place.T.reshape(-1, place.shape[0]) for place in graph.inputs)
         start[:] = starts[..., : start.shape[1]]
         target[:, :2], target[:, 2:], numbers[:] = self.p[rows], self.q[rows], self._numbers
@@ -338,53 +239,6 @@ class _Work:
         to["residual_norm"][rows], to["drift"][rows] = verdict[:, 0], verdict[:, 4]
 
 
-@per_thread(maxsize=32)
-def _numbers(robot: Robot) -> tuple[Kind, np.ndarray]:
-    kind = Kind(robot.n_rods, robot_layout(robot))
-    return kind, kind.pack(robot)
-
-
 def _record(eq: Equilibrium) -> np.ndarray:
     assert eq.record is not None
     return eq.record
-
-
-@per_thread(maxsize=32)
-def _many(kind: Kind, method: RodMethod, count: int, along: bool, compiled: bool) -> BufferedFunction:
-    return BufferedFunction(_many_graph(kind, method, count, along, compiled))
-
-
-@graph_cache(maxsize=8)
-def _one_graph(kind: Kind, method: RodMethod, compiled: bool) -> Any:
-    # A compiler is given a rod once, not as often as it is solved: a third of the time to build, the same bits.
-    if compiled:
-        return machine_code(warm_calls(kind, for_compiler(method), method.settling))
-    return warm_step(kind, method, method.settling)
-
-
-@graph_cache(maxsize=32)
-def _many_graph(kind: Kind, method: RodMethod, count: int, along: bool, compiled: bool) -> Any:
-    """(record or starts, targets, numbers) -> records, verdicts, results of ``count`` poses."""
-    warm = _one_graph(kind, method, compiled)
-    target, start, numbers = (ca.MX.sym(warm.name_in(i), *warm.size_in(i)) for i in range(3))
-    if not along:
-        found = warm(target, start, numbers)
-        return ca.Function("pose", [start, target, numbers], found).map("poses", "serial", count, [2], [])
-    step = _one_step(kind, method, compiled)
-    targets = ca.MX.sym("targets", target.numel(), count)
-    record = ca.MX.sym("record", step.numel_in(0))
-    moved: Any = step.mapaccum("poses", count, 1, {})(record, targets, ca.repmat(numbers, 1, count))
-    return ca.Function("path", [record, targets, numbers], list(moved))
-
-
-@graph_cache(maxsize=8)
-def _one_step(kind: Kind, method: RodMethod, compiled: bool) -> Any:
-    """From a record to the next, for a path of any length.
-
-    The whole record goes on from pose to pose, though only its first part is started from: it is there once.
-    """
-    warm = _one_graph(kind, method, compiled)
-    target, start, numbers = (ca.MX.sym(warm.name_in(i), *warm.size_in(i)) for i in range(3))
-    record = ca.MX.sym("record", warm.numel_out(0))
-    step = ca.Function("pose", [record, target, numbers], warm(target, record[: start.numel()], numbers))
-    return step.expand() if warm.is_a("SXFunction") else step

@@ -1,0 +1,1 @@
+"""Statics of many poses at once."""
