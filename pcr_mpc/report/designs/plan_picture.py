@@ -23,6 +23,7 @@ _COLOURS = {
     "tip jerk": "#882255",
     "stiffness": "#332288",
     "rod margin": "#44AA99",
+    "strain": "#661100",
 }
 _NONE = "none of them"
 _HARDLY = 0.05  # share below which a limit is not drawn

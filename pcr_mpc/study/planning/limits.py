@@ -13,7 +13,7 @@ from ...linearisation.pose_limits import PoseLimits
 from ...loop.scene.scene import Scene
 from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.many_poses.equilibria import Equilibria
-from ...plant.statics.margins import loads
+from ...plant.statics.margins import largest_strains, loads
 from .angles import followed
 from .linear import Linear
 
@@ -29,6 +29,7 @@ UNITS = {
     "tip jerk": "m/s^3",
     "stiffness": "N/m",
     "rod margin": "1",
+    "strain": "1",
 }
 _WATCHED = 0.8  # of a margin's limit, from which on its slope is computed
 _ANGLE = 1e-5  # by which motors are turned to see how margins change [rad]
@@ -50,6 +51,8 @@ class PlanLimits:
         Least eigenvalue of K [N/m]. 0 is none.
     tip_lower, tip_upper : (float, float) or None
         Corners of the box in which the tip is to stay [m].
+    strains : tuple of float
+        Largest strain of each rod [-]; infinite is none. Empty: of none.
     """
 
     rate: float
@@ -62,6 +65,7 @@ class PlanLimits:
     stiffness: float = 0.0
     tip_lower: tuple[float, float] | None = None
     tip_upper: tuple[float, float] | None = None
+    strains: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for field in fields(self)[:6]:
@@ -72,7 +76,9 @@ class PlanLimits:
         check_numbers(self, {"stiffness": {"minimum": 0.0}})
 
     def value(self, kind: str) -> float | None:
-        """Value of a limit by its name; None if it is an interval."""
+        """Value of a limit by its name, of strains the least; None if it is an interval."""
+        if kind == "strain":
+            return min(self.strains)
         names = {"motor rate": "rate", "change of rate": "acceleration", "motor torque": "torque"}
         found: float | None = getattr(self, names.get(kind, kind.replace(" ", "_")), None)
         return found
@@ -89,6 +95,7 @@ class PlanLimits:
             stiffness=poses.stiffness or 0.0,
             tip_lower=poses.tip_lower,
             tip_upper=poses.tip_upper,
+            strains=tuple(scene.strain_limits.tolist()) if np.isfinite(scene.strain_limits).any() else (),
             **more,
         )
 
@@ -173,6 +180,8 @@ def uses(limits: PlanLimits, asked: Asked) -> list[Use]:
         found.append(_stiffness(limits.stiffness, asked))
     if limits.rod_margin > -math.inf and asked.poses.method == "closed_form":
         found.append(_rod_margin(limits.rod_margin, asked))
+    if limits.strains:
+        found.append(_strain(np.array(limits.strains), asked))
     return found
 
 
@@ -201,6 +210,16 @@ def _rod_margin(least: float, asked: Asked) -> Use:
         # Rods do not couple at a held tip: all motors at once.
         slope = (loads(_turned(asked, slice(None)), _WATCHED * most) - here) / _ANGLE
     return Use("rod margin", (1.0 / most) * Linear(here, slope[:, :, None] * asked.q.slope), both=False)
+
+
+def _strain(limits: np.ndarray, asked: Asked) -> Use:
+    """Largest strain of each rod over what it bears; none where no thickness is known."""
+    here = np.nan_to_num(largest_strains(asked.poses) / limits)
+    slope = np.zeros_like(here)
+    if asked.q.slope.size and here.max() > _WATCHED:
+        # Rods do not couple at a held tip: all motors at once.
+        slope = (np.nan_to_num(largest_strains(_turned(asked, slice(None))) / limits) - here) / _ANGLE
+    return Use("strain", Linear(here, slope[:, :, None] * asked.q.slope), both=False)
 
 
 def _turned(asked: Asked, motors: int | slice) -> Equilibria:

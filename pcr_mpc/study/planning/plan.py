@@ -22,7 +22,7 @@ from .along_path.refining import ALLOWED, refined
 from .along_path.starting import STATICS, evened, resting, started, where
 from .along_path.timing import Problem, Timing
 from .freely.free import Freed, freed, way_points
-from .limits import PlanLimits
+from .limits import PlanLimits, uses
 from .motion import Carrier
 from .rods_mass import asked_of_motors, with_rods
 from .timed_path import Paced, RodsMass, TimedPath
@@ -239,6 +239,7 @@ def _result(name: str, timing: Timing, fine: Timing, deviation: float, iteration
 
 def _free_result(name: str, found: Freed, given: list[TipPath], limits: PlanLimits, iterations: int) -> TimedPath:
     asked = found.asked
+    used = uses(limits, asked)
     return TimedPath(
         name,
         found.move,
@@ -250,8 +251,8 @@ def _free_result(name: str, found: Freed, given: list[TipPath], limits: PlanLimi
         motion=np.stack([asked.p, asked.velocity.value, asked.acceleration.value], axis=1),
         q=asked.q.value.copy(),
         rates=asked.rate.value.copy(),
-        kinds=tuple(use.limit for use in found.uses),
-        shares=np.stack([use.largest for use in found.uses]),
+        kinds=tuple(use.limit for use in used),
+        shares=np.stack([use.largest for use in used]),
         iterations=iterations,
     )
 

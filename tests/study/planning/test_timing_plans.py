@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from pcr_mpc import (
+    Blended,
     Line,
     PlanLimits,
+    Spline,
     inverse_statics,
     load_path,
     make_controller,
@@ -209,3 +211,39 @@ def test_margins_and_torque_limit_too(scene):
     assert kept.excess <= 1e-3
     shares = dict(zip(kept.kinds, kept.shares.max(axis=1), strict=True))
     assert max(shares["rod margin"], shares["motor torque"]) > 0.99
+
+
+@pytest.mark.slow
+def test_a_strain_that_the_material_does_not_bear_is_kept_off(scene):
+    """The largest strain of poses that are found one by one; and it takes time."""
+    limits = PlanLimits.of_scene(scene)
+    assert limits.strains == pytest.approx(scene.robot.strain_limits)
+    fast = plan_timing(scene, limits=replace(limits, strains=()), cells=40)
+    assert "strain" not in fast.kinds
+
+    def strains(planned):
+        t = np.linspace(0.0, planned.duration, 401)
+        return np.stack([eq.max_strain for eq in motors(scene.robot, planned, t, scene.start())]).max(axis=0)
+
+    least = 0.97 * strains(fast).max()
+    kept = plan_timing(scene, limits=replace(limits, strains=(least, least)), cells=40)
+    assert 0.995 * least < strains(kept).max() <= 1.001 * least
+    assert kept.duration > fast.duration
+    assert kept.excess <= 1e-3
+
+
+@pytest.mark.slow
+def test_a_torque_that_is_hardly_more_than_rest_takes_is_kept(points_scene):
+    """The programs end where a change of rate is exceeded: the motion is made slower, and then faster again."""
+    points = ((-0.05, 0.2), (-0.045, 0.26), (-0.01, 0.23), (0.015, 0.275), (0.05, 0.265), (0.03, 0.225), (0.055, 0.195),
+              (0.0, 0.185))  # fmt: skip
+    scene = replace(points_scene, trajectory=Blended(Spline(points, speed=0.1)))
+    planned = plan_timing(scene, limits=replace(PlanLimits.of_scene(scene), torque=0.95))
+    assert planned.excess <= 1e-3
+    t = np.linspace(0.0, planned.duration, 3001)
+    poses = motors(scene.robot, planned, t, scene.start())
+    rates = np.diff([eq.q for eq in poses], axis=0) / t[1]
+    changes = np.diff(rates, axis=0, prepend=0.0, append=0.0) / t[1]
+    assert 0.99 < max(np.abs(eq.motor_torque).max() for eq in poses) / 0.95 <= 1.001
+    assert np.abs(rates).max() <= 1.001 * scene.robot.rate_limit
+    assert np.abs(changes).max() <= 1.001 * scene.robot.acceleration_limit

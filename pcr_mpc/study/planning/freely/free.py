@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BPoly, CubicSpline
@@ -75,6 +75,7 @@ class Freed:
         [s].
     asked : Asked
     uses : list of Use
+        Of all limits but those on strain.
     grid : int
         Points at which limits were kept.
     iterations : int
@@ -111,7 +112,8 @@ def freed(timing: Timing, points: np.ndarray, intervals: int, allowed: float) ->
     ConvergenceError
         A limit is exceeded between the points where it was kept.
     """
-    problem = timing.problem
+    # Strain is no part of the programs: of the result is said how large it is.
+    problem = replace(timing.problem, limits=replace(timing.problem.limits, strains=()))
     require_plain(problem.pose.robot, "a free path (free)")
     hands, rods = rod_unknowns(problem.pose.robot, problem.pose)
     moved = _started(timing, points, intervals, rods)
