@@ -8,6 +8,10 @@ from ..tables import table
 
 LIGHT = 0.01  # share of the rods in the mass that moves, below which nobody is told
 _RESOLUTION = 1e-3  # of a limit, between the points at which a plan keeps it
+_SLOWED = (
+    "slowed      all of it, until its limits are kept: it may take longer than it must;\n"
+    "            allow more of what is used most, or try other --cells"
+)
 _KNOWN = 'inertia = "condensed" under [model] in the scene\'s tuning lets the plan reckon with it'
 
 
@@ -30,6 +34,7 @@ def plan_table(summary: dict[str, Any]) -> str:
         f"path        {summary['length_mm']:.1f} mm, within {summary['deviation_mm']:.3g} mm of the reference's",
         f"top speed   {summary['top_speed_m_s']:.3g} m/s",
         *_rods_lines(summary),
+        *([_SLOWED] if summary.get("slowed") else []),
         "",
         table(("limit", "value", "unit", "most used [%]", "at [s]", "acts [% of time]"), rows),
         "",

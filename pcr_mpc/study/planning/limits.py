@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -128,6 +129,11 @@ class Asked:
     poses: Equilibria
     pose: Equilibrium
 
+    @cached_property
+    def turned(self) -> Equilibria:
+        """Poses with all motors turned a little more: rods do not couple at a held tip."""
+        return _turned(self, slice(None))
+
 
 @dataclass(frozen=True, eq=False)
 class Use:
@@ -207,8 +213,7 @@ def _rod_margin(least: float, asked: Asked) -> Use:
     poses, most = asked.poses, 1.0 - least
     here, slope = loads(poses, _WATCHED * most), np.zeros_like(poses.q)
     if asked.q.slope.size and here.max() > _WATCHED * most:
-        # Rods do not couple at a held tip: all motors at once.
-        slope = (loads(_turned(asked, slice(None)), _WATCHED * most) - here) / _ANGLE
+        slope = (loads(asked.turned, _WATCHED * most) - here) / _ANGLE
     return Use("rod margin", (1.0 / most) * Linear(here, slope[:, :, None] * asked.q.slope), both=False)
 
 
@@ -217,8 +222,7 @@ def _strain(limits: np.ndarray, asked: Asked) -> Use:
     here = np.nan_to_num(largest_strains(asked.poses) / limits)
     slope = np.zeros_like(here)
     if asked.q.slope.size and here.max() > _WATCHED:
-        # Rods do not couple at a held tip: all motors at once.
-        slope = (np.nan_to_num(largest_strains(_turned(asked, slice(None))) / limits) - here) / _ANGLE
+        slope = (np.nan_to_num(largest_strains(asked.turned) / limits) - here) / _ANGLE
     return Use("strain", Linear(here, slope[:, :, None] * asked.q.slope), both=False)
 
 

@@ -18,9 +18,9 @@ from .along_path.legs import joined
 from .along_path.meshing import repaced
 from .along_path.pace import spline_of, times
 from .along_path.path import TipPath, paths_of
-from .along_path.refining import ALLOWED, refined
+from .along_path.refining import ALLOWED, Refined, refined
 from .along_path.starting import STATICS, evened, resting, started, where
-from .along_path.timing import Problem, Timing
+from .along_path.timing import Problem
 from .freely.free import Freed, freed, way_points
 from .limits import PlanLimits, uses
 from .motion import Carrier
@@ -166,8 +166,7 @@ def _planned(
     if freely is not None:
         found = freed(timing, freely[0], wanted, ALLOWED)
         return _free_result(name, found, freely[1], problem.limits, iterations + found.iterations)
-    timing, fine = refined(timing, counted)
-    return _result(name, timing, fine, path.deviation, iterations)
+    return _result(name, refined(timing, counted), path.deviation, iterations)
 
 
 def carrier_of(scene: Scene, span: float) -> Carrier:
@@ -218,7 +217,8 @@ def _distance(paths: list[TipPath], tips: np.ndarray) -> float:
     return away + max(path.deviation for path in paths)
 
 
-def _result(name: str, timing: Timing, fine: Timing, deviation: float, iterations: int) -> TimedPath:
+def _result(name: str, found: Refined, deviation: float, iterations: int) -> TimedPath:
+    timing, fine = found.timing, found.fine
     moved, turned = fine.moved, fine.turned
     return TimedPath(
         name,
@@ -234,6 +234,7 @@ def _result(name: str, timing: Timing, fine: Timing, deviation: float, iteration
         kinds=tuple(use.limit for use in fine.uses),
         shares=fine.shares,
         iterations=iterations,
+        slowed=found.slowed,
     )
 
 

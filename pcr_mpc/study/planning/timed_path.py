@@ -138,6 +138,8 @@ class TimedPath(Frozen):
     shares : ndarray, shape (limits, K)
         Largest share of each that is used: 1 is all of it.
     iterations : int
+    slowed : bool
+        Whether all of it had to be made slower to keep its limits: it may take longer than it must.
     rods : RodsMass or None
         With the rods' inertia, if the plan reckons with it; ``limits`` are then lowered.
     """
@@ -155,6 +157,7 @@ class TimedPath(Frozen):
     kinds: tuple[str, ...]
     shares: np.ndarray
     iterations: int
+    slowed: bool = False
     rods: RodsMass | None = None
 
     @property
@@ -216,5 +219,6 @@ class TimedPath(Frozen):
             "checked": len(self.t),
             "largest_excess": self.excess,
             "iterations": self.iterations,
+            "slowed": self.slowed,
             "rods": None if self.rods is None else self.rods.summary(),
         }

@@ -18,6 +18,8 @@ from pcr_mpc import (
     simulate,
 )
 from pcr_mpc.loop.references.trajectory import smooth_step
+from pcr_mpc.report.designs.plan_table import plan_table
+from pcr_mpc.study.planning.along_path import refining
 from pcr_mpc.study.planning.along_path.course import paced
 from pcr_mpc.study.planning.along_path.meshing import points
 from pcr_mpc.study.planning.along_path.pace import constant_pace, spline_of
@@ -33,6 +35,8 @@ NO_MOTORS = {"rate": 1e6, "acceleration": 1e12, "torque": 1e3}
 def test_limits_are_kept_at_ten_times_the_grid(points_scene, planned):
     """Angles found one by one, rates and their change by differences of the angles alone."""
     assert planned.excess <= 1e-3
+    assert not planned.slowed
+    assert "may take longer than it must" not in plan_table(planned.summary())
     scene, robot = points_scene, points_scene.robot
     t = np.linspace(0.0, planned.duration, 10 * planned.grid + 1)
     step = t[1]
@@ -239,6 +243,8 @@ def test_a_torque_that_is_hardly_more_than_rest_takes_is_kept(points_scene):
               (0.0, 0.185))  # fmt: skip
     scene = replace(points_scene, trajectory=Blended(Spline(points, speed=0.1)))
     planned = plan_timing(scene, limits=replace(PlanLimits.of_scene(scene), torque=0.95))
+    assert planned.slowed
+    assert "may take longer than it must" in plan_table(planned.summary())
     assert planned.excess <= 1e-3
     t = np.linspace(0.0, planned.duration, 3001)
     poses = motors(scene.robot, planned, t, scene.start())
@@ -247,3 +253,13 @@ def test_a_torque_that_is_hardly_more_than_rest_takes_is_kept(points_scene):
     assert 0.99 < max(np.abs(eq.motor_torque).max() for eq in poses) / 0.95 <= 1.001
     assert np.abs(rates).max() <= 1.001 * scene.robot.rate_limit
     assert np.abs(changes).max() <= 1.001 * scene.robot.acceleration_limit
+
+
+def test_what_is_said_of_a_plan_is_said_of_its_last_pace(scene, monkeypatch):
+    """Also where rounds run out, and what is left of an excess is accepted: what was checked is what is written."""
+    monkeypatch.setattr(refining, "_ROUNDS", 1)
+    monkeypatch.setattr(refining, "_LARGEST_EXCESS", 1.0)
+    planned = plan_timing(scene, cells=30)
+    assert planned.t[-1] == pytest.approx(planned.duration, rel=1e-12)
+    assert planned(planned.t)[:, 0] == pytest.approx(planned.motion[:, 0], abs=1e-9)
+    assert len(planned.t) > 30 * refining.FINE  # the fine grid, not the one that finds most

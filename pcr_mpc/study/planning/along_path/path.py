@@ -92,15 +92,15 @@ def paths_of(trajectory: Trajectory, duration: float, tolerance: float) -> list[
 def _sampled(trajectory: Trajectory, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Points of a motion, closer together where its path turns sharply, and the speeds there."""
     t = np.linspace(0.0, duration, _SAMPLES)
+    samples = sampled(trajectory, t)
     for _ in range(_CLOSER):
-        samples = sampled(trajectory, t)
         moving, turns = _turns(samples[:, 0])
         sharp = np.unique(np.concatenate([moving[:-1][turns > _SHARP], moving[1:][turns > _SHARP]]))
         if not 0 < sharp.size < _FEW * len(t):
             break
         between = t[sharp, None] + (t[sharp + 1] - t[sharp])[:, None] * np.array([0.25, 0.5, 0.75])
         t = np.sort(np.concatenate([t, between.ravel()]))
-    samples = sampled(trajectory, t)
+        samples = sampled(trajectory, t)
     return samples[:, 0], np.linalg.norm(samples[:, 1], axis=1)
 
 

@@ -17,7 +17,7 @@ ALLOWED = 1.0 - 5e-4  # share of the limits that is used, so that they are kept 
 _EXCESS = 1e-4  # over 1, on the fine grid, at which no more points are added
 _LARGEST_EXCESS = 1e-3
 _ROUNDS, _ITERATIONS, _GAIN = 14, 6, 1e-3  # of the duration
-_SLOWER = (1.005, 1.01, 1.02, 1.03, 1.05, 1.1, 1.2, 1.5)  # times as long
+_LONGER = (1.005, 1.01, 1.02, 1.03, 1.05, 1.1, 1.2, 1.5)  # times as long
 _AGAIN = 0.2  # by which share a coefficient may change then
 _APART = 1e-6  # nearer points are the same
 
@@ -34,56 +34,67 @@ class Checked(NamedTuple):
         return float(self.shares.max())
 
 
-def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tuple[Timing, Timing]:
-    """Add points where limits are exceeded between the points, until they are kept on a grid ten times as fine.
+class Refined(NamedTuple):
+    """A timing that keeps its limits between its points too.
 
-    Returns
-    -------
+    Attributes
+    ----------
     timing, fine : Timing
-        At the points where its limits were kept, and on the fine grid.
+        At the points where limits were kept, and on a grid ten times as fine.
+    slowed : bool
+        Whether all of it had to be made slower: it may take longer than it must.
+    """
+
+    timing: Timing
+    fine: Timing
+    slowed: bool
+
+
+def refined(timing: Timing, told: Callable[[float], None] | None = None) -> Refined:
+    """Add points where limits are exceeded between the points, until they are kept on a grid ten times as fine.
 
     Raises
     ------
     ConvergenceError
         They are not kept to a thousandth.
     """
-    per_cell = FINE // 3  # which finds most
-    between, tolerance = points(cells_of(timing.pace), per_cell), NEAR
+    per_cell, tolerance = FINE // 3, NEAR  # a coarser grid finds most
     for _ in range(_ROUNDS):
+        between = points(cells_of(timing.pace), per_cell)
         fine, checked = checked_at(timing, between, tolerance, suspect=1.0 + _EXCESS)
         if checked.worst <= 1.0 + _EXCESS:
             if tolerance == EXACT:
-                return timing, fine
-            if per_cell == FINE:
-                tolerance = EXACT
-            per_cell, between = FINE, points(cells_of(timing.pace), FINE)
+                return Refined(timing, fine, slowed=False)
+            per_cell, tolerance = FINE, EXACT if per_cell == FINE else NEAR
             continue
         x = with_points(timing.x, checked, ALLOWED)
         more = faster(timing.at(x), most=_ITERATIONS, trust=0.1, allowed=ALLOWED, tolerance=_GAIN, told=told)
         if more.pace is timing.pace and len(x) == len(timing.x):
             break
         timing, tolerance = more, NEAR
-    if checked.worst > 1.0 + _LARGEST_EXCESS:
-        # Nearer to rest less is asked for: where the programs find no way, all of it is made slower.
-        between = points(cells_of(timing.pace), FINE)
-        for slower in _SLOWER:
-            try:
-                slow = _made_slower(timing, slower)
-                fine, checked = checked_at(slow, between, EXACT, suspect=1.0 + _EXCESS)
-            except PCRError:
-                continue
-            if checked.worst <= 1.0 + _EXCESS:
-                return _faster_again(slow, fine, between, told)
-        limit, at = np.unravel_index(int(checked.shares.argmax()), checked.shares.shape)
-        raise ConvergenceError(
-            f"the plan still exceeds the limit on {fine.uses[limit].limit} by {100 * (checked.worst - 1):.3g} % at "
-            f"{times(fine.pace, checked.x)[at]:.4f} s after {_ROUNDS} refinements, and in {_SLOWER[-1]:g} "
-            f"times the time; allow more of it, or take other cells than {cells_of(fine.pace)}",
-            residual=checked.worst - 1.0,
-            iterations=_ROUNDS,
-            last=fine.pace.c,
-        )
-    return timing, fine
+    # What is said of the last pace is what it is found to ask for.
+    between = points(cells_of(timing.pace), FINE)
+    fine, checked = checked_at(timing, between, EXACT, suspect=1.0 + _EXCESS)
+    if checked.worst <= 1.0 + _LARGEST_EXCESS:
+        return Refined(timing, fine, slowed=False)
+    # Nearer to rest less is asked for: where the programs find no way, all of it is made slower.
+    for longer in _LONGER:
+        try:
+            slow = _slower(timing, longer)
+            there, kept = checked_at(slow, between, EXACT, suspect=1.0 + _EXCESS)
+        except PCRError:
+            continue
+        if kept.worst <= 1.0 + _EXCESS:
+            return Refined(*_faster_again(slow, there, between, told), slowed=True)
+    limit, at = np.unravel_index(int(checked.shares.argmax()), checked.shares.shape)
+    raise ConvergenceError(
+        f"the plan still exceeds the limit on {fine.uses[limit].limit} by {100 * (checked.worst - 1):.3g} % at "
+        f"{times(fine.pace, checked.x)[at]:.4f} s after {_ROUNDS} refinements, and some limit in {_LONGER[-1]:g} times "
+        f"the time too; allow more of it, or take other cells than {cells_of(fine.pace)}",
+        residual=checked.worst - 1.0,
+        iterations=_ROUNDS,
+        last=fine.pace.c,
+    )
 
 
 def _faster_again(
@@ -101,7 +112,7 @@ def _faster_again(
     return slow, fine
 
 
-def _made_slower(timing: Timing, longer: float) -> Timing:
+def _slower(timing: Timing, longer: float) -> Timing:
     """Return the same motion in so many times the time."""
     pace = spline_of(longer**-2.0 * timing.pace.c)
     return evaluated(timing.problem, pace, timing.x, timing.turned.q.value, timing.turned.poses)
