@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from ...errors import ConvergenceError, PCRError, checked_integer, checked_vecto
 from ...frozen import Frozen
 from ..robot import Robot
 from ..rods.closed_form import elastica
-from ..rods.closed_form.chart import LEAST_CRITICAL_LOAD, HeldShape, critical_load, stable_shapes
+from ..rods.closed_form.chart import HeldShape, critical_load, stable_shapes
 from ..rods.equations import aligned_steps, sample_rod
 from ..rods.method import closed_form_method
 from ..rods.physics import require_plain
@@ -24,7 +23,6 @@ from .free_tip import free_solver
 from .solver import RodSolver
 
 _MAX_ITERATIONS = 40
-NEAR = 0.3  # margin of a rod below which it is computed exactly
 _BALANCED = 1e-9  # residual force, of sum EI/L^2
 _SAME = 1e-4  # of the rods' length, and of EI/L^2 and their forces, within which two poses are one
 _RESOLVED = 1e-5  # residual and drift at which the sweep is trusted
@@ -82,26 +80,16 @@ def assess_stability(eq: Equilibrium) -> Stability:
 
 
 def least_rod_margin(eq: Equilibrium) -> float:
-    """Least 1 - lambda / lambda_c of the rods, exact below 0.3, above that at least so much; NaN if they are not plain.
-
-    Cheaper than `assess_stability`, where many poses are gone through.
-    """
+    """Least 1 - lambda / lambda_c of the rods; NaN if they are not plain. Cheaper than `assess_stability`."""
     return min(rod_margins(eq))
 
 
 def rod_margins(eq: Equilibrium) -> list[float]:
-    """1 - lambda / lambda_c of each rod, as `least_rod_margin` has it."""
+    """1 - lambda / lambda_c of each rod; NaN if they are not plain."""
     if eq.robot.needs_shooting is not None:
         return [float("nan")] * eq.robot.n_rods
-    margins = []
-    for i, (force, rod) in enumerate(zip(eq.rod_forces.tolist(), eq.robot.rods, strict=True)):
-        load = rod.length * math.sqrt(math.hypot(*force) / rod.bending_stiffness)
-        bound = 1.0 - load / LEAST_CRITICAL_LOAD
-        if bound < NEAR:
-            log_tip_angle, load, _ = elastica.from_nodes(eq.nodes[i])
-            bound = 1.0 - load / critical_load(log_tip_angle)
-        margins.append(bound)
-    return margins
+    shapes = (elastica.from_nodes(nodes) for nodes in eq.nodes)
+    return [1.0 - load / critical_load(log_tip_angle) for log_tip_angle, load, _ in shapes]
 
 
 def count_conjugate_points(eq: Equilibrium, segments: int = 16) -> int:

@@ -209,11 +209,13 @@ def _stiffness(least: float, asked: Asked) -> Use:
 
 
 def _rod_margin(least: float, asked: Asked) -> Use:
-    """Lambda over lambda_c, over the most that is allowed."""
+    """Lambda over lambda_c, over the most that is allowed; good to 1 %, and to 5 % at most, where it is far from it."""
     poses, most = asked.poses, 1.0 - least
-    here, slope = loads(poses, _WATCHED * most), np.zeros_like(poses.q)
-    if asked.q.slope.size and here.max() > _WATCHED * most:
-        slope = (loads(asked.turned, _WATCHED * most) - here) / _ANGLE
+    rough = loads(poses, np.zeros(poses.q.shape, dtype=bool))
+    near = rough > _WATCHED * most
+    here, slope = loads(poses, near) if near.any() else rough, np.zeros_like(poses.q)
+    if asked.q.slope.size and near.any():
+        slope[near] = (loads(asked.turned, near) - here)[near] / _ANGLE
     return Use("rod margin", (1.0 / most) * Linear(here, slope[:, :, None] * asked.q.slope), both=False)
 
 
