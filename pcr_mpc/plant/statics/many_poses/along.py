@@ -34,7 +34,8 @@ def inverse_statics_along(robot: Robot, p: Any, force: Any, guess: Equilibrium) 
     """Inverse statics at every pose of a path, each on the branch of the one before.
 
     Finds what `inverse_statics` finds from pose to pose, to the same tolerance; where the graph does not lead on, that
-    is asked.
+    is asked. Of more than two motors the angles are those of least motion along the path, to which small steps of
+    `inverse_statics` lead: their error falls with the square of the distance between poses.
 
     Parameters
     ----------
@@ -159,6 +160,7 @@ def _path_graph(kind: Kind, method: RodMethod, count: int) -> Any:
     pose, record, result = ca.vertsplit(state, [0, pose_size, pose_size + record_size, state.numel()])
     p, wanted = target[:2], target[2:]
     force, k, g = _parts(result, n)
+    before = g
     turned = pose[2:] + least_motion(g, wanted - force - k @ (p - pose[:2]))
     changed = conjugate_points = residual = ca.MX(0)
     for _ in range(_TRIALS):
@@ -168,6 +170,9 @@ def _path_graph(kind: Kind, method: RodMethod, count: int) -> Any:
         force, k, g = _parts(result, n)
         missed = wanted - force
         turned = reached + least_motion(g, missed)
+        if n > 2:  # the least motion for the middle of the way, not for its start: an error of second order
+            middle, way = (before + g) / 2, turned - pose[2:]
+            turned = pose[2:] + least_motion(middle, middle @ way)
     moved = ca.vertcat(p, reached, record, result)
     half, skew = (k[0, 0] - k[1, 1]) / 2, (k[0, 1] + k[1, 0]) / 2
     softest = (k[0, 0] + k[1, 1]) / 2 - ca.norm_2(ca.vertcat(half, skew))
