@@ -27,9 +27,10 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
 
     Where the plant's rods have inertia, M_pp stands for m, and its change with the pose times the acceleration
     at x goes into K and G. The rates act through M_pq as impulses at both ends of the period (see `Plant`), which
-    makes the tip move with v - M_pp^-1 M_pq u. Left out are the Coriolis terms and the change of M_pp^-1 M_pq u
-    with the pose, products of velocities: on the default robot at 0.3 m/s and 2 rad/s they are worth 5e-8 m in
-    10 ms, as much as the curvature of F; leaving out the rods' inertia as a whole costs 1e-5 m.
+    makes the tip move with v - M_pp^-1 M_pq u. Products of velocities, dT/dp - M_pp' v and the change of
+    M_pp^-1 M_pq u with the pose, are those at x and u; left out is how they change with both. What is left of the
+    error is then that of rods without mass, the curvature of F: 1e-7 m in 10 ms on the default robot at 0.3 m/s
+    and 2 rad/s. On steel wires of 9 % of the moving mass, a figure of eight is tracked eight times better for it.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     x : array_like, shape (4 + n,)
         State [m, m/s, rad].
     u : array_like, shape (n,)
-        Input [rad/s]. The plant is affine in u, so the model does not depend on it; it is checked only.
+        Input [rad/s]. Without inertia of the rods the plant is affine in u, and the model does not depend on it.
     dt : float
         Period of the model [s], usually the control period.
     f_ext : array_like, shape (2,)
@@ -52,7 +53,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
         dt is not a positive number, or so long that K dt^2/m or (c dt/m)^2 exceeds 1000; or the model overflows.
     """
     x = checked_vector("x", x, plant.n_states)
-    checked_vector("u", u, plant.robot.n_rods)
+    u = checked_vector("u", u, plant.robot.n_rods)
     f_ext = checked_vector("f_ext", f_ext, 2)
     dt = checked_number("dt", dt, above=0.0)
     force, k, g = plant.force_and_jacobians(x[:2], x[4:], DERIVATIVE_ACCURACY)
@@ -71,7 +72,7 @@ def linearise(plant: Plant, x: Any, u: Any, dt: float, f_ext: Any = (0.0, 0.0)) 
     function.inputs[2][:] = force - f_ext - plant.tip_weight
     function.inputs[3][:] = x
     function.inputs[4][:] = drag, dt
-    function.inputs[5][:], function.inputs[6][:] = inertia, slopes
+    function.inputs[5][:], function.inputs[6][:], function.inputs[7][:] = inertia, slopes, u
     function()
     packed = function.outputs[0].copy()
     n = plant.n_states
@@ -98,6 +99,7 @@ def discretisation(n: int, *, point: bool = False) -> Any:
     k, g, force = ca.SX.sym("K", 2, 2), ca.SX.sym("G", 2, n), ca.SX.sym("F", 2)
     x, parameters = ca.SX.sym("x", 4 + n), ca.SX.sym("parameters", 2)
     mass, slopes = ca.SX.sym("M", 2 + n, 2 + n), ca.SX.sym("dM", (2 + n) ** 2, 2 + n)
+    rates = ca.SX.sym("rates", n)
     drag, dt = ca.vertsplit(parameters)
     p, v, q = x[:2], x[2:4], x[4:]
 
@@ -126,11 +128,23 @@ def discretisation(n: int, *, point: bool = False) -> Any:
     # About x: y = x - x0, so that the constant is what is left after A x0.
     state = ca.vertcat(0, 0, dt * v)
     moved = exponential @ state - dt * dt * (phi_1 @ (inverse @ force))
+    if not point:
+        push, drift = _centrifugal(mass, slopes, v, rates, inverse, coupling)
+        moved += dt * dt * (phi_1 @ (inverse @ push - drift) + ca.vertcat(0, 0, drift))
     c_vector = ca.vertcat(p + moved[:2], moved[2:] / dt, q) - a_matrix @ x
     e_matrix = ca.vertcat(ca.diag(units) @ phi_1 @ scale, ca.SX(n, 2))
     results = [ca.vertcat(ca.vec(a_matrix), c_vector, ca.vec(b_matrix), ca.vec(e_matrix))]
-    arguments = [k, g, force, x, parameters, mass, slopes]
+    arguments = [k, g, force, x, parameters, mass, slopes, rates]
     return ca.Function("discretise", arguments, results, {"cse": True})
+
+
+def _centrifugal(mass: Any, slopes: Any, v: Any, rates: Any, inverse: Any, coupling: Any) -> tuple[Any, Any]:
+    """What moving rods do to the tip: dT/dp - M_pp' v [N], and (M_pp^-1 M_pq)' u [m/s^2], at rates u."""
+    size = mass.size1()
+    w = ca.vertcat(v - coupling @ rates, rates)
+    by_tip = ca.vertcat(*(ca.bilin(ca.reshape(slopes[:, j], size, size), w, w) / 2 for j in range(2)))
+    change = ca.reshape(slopes @ w, size, size)[:2, :]
+    return by_tip - change[:, :2] @ v, inverse @ ((change[:, 2:] - change[:, :2] @ coupling) @ rates)
 
 
 def _of_mass(stiffness: Any, damping: Any) -> tuple[Any, Any, Any]:

@@ -74,19 +74,20 @@ def model_graph(model: StepModel, iterations: int) -> Any:
     Returns
     -------
     casadi.Function
-        (x (4 + n), f_ext (2) [N], payload [kg], memory, numbers, M (2 + n, 2 + n), dt) -> record, model (see `Sizes`),
-        verdict (7): that of `warm_step`, then K dt^2/m and (c dt/m)^2 (see `linearise`). M is the mass matrix where
-        the inertia is "constant", and not used otherwise.
+        (x (4 + n), u (n) [rad/s], f_ext (2) [N], payload [kg], memory, numbers, M (2 + n, 2 + n), dt) -> record, model
+        (see `Sizes`), verdict (7): that of `warm_step`, then K dt^2/m and (c dt/m)^2 (see `linearise`). M is the mass
+        matrix where the inertia is "constant", and not used otherwise.
     """
     kind, n = model.kind, model.kind.n_rods
     x, f_ext, payload = ca.MX.sym("x", 4 + n), ca.MX.sym("f_ext", 2), ca.MX.sym("payload")
     memory, vector = ca.MX.sym("memory", sizes(model).memory), ca.MX.sym("numbers", kind.size)
     constant, dt = ca.MX.sym("mass", 2 + n, 2 + n), ca.MX.sym("dt")
+    rates = ca.MX.sym("rates", n)
     numbers = kind.unpack(vector)
     record, verdict, force, k, g = force_graph(model, iterations)(ca.vertcat(x[:2], x[4:]), memory, vector)
     if model.inertia == "none":
         packed, ratios = _of_point_mass(kind)(force, k, g, f_ext, payload, x, vector, dt)
-        return ca.Function("model", [x, f_ext, payload, memory, vector, constant, dt],
+        return ca.Function("model", [x, rates, f_ext, payload, memory, vector, constant, dt],
                            [record, packed, ca.vertcat(verdict, ratios)])  # fmt: skip
     tip = numbers.tip_mass + payload
     slopes = ca.DM.zeros((2 + n) ** 2, 2 + n)
@@ -98,9 +99,9 @@ def model_graph(model: StepModel, iterations: int) -> Any:
         mass, slopes = mass_calls(kind, model.method)(unknowns, x[4:], of_rods)
     mass = mass + ca.diag(ca.vertcat(payload, payload, ca.DM.zeros(n)))
     push = force - f_ext - tip * numbers.gravity
-    packed = discretisation(n)(k, g, push, x, ca.vertcat(numbers.drag, dt), mass, slopes)
+    packed = discretisation(n)(k, g, push, x, ca.vertcat(numbers.drag, dt), mass, slopes, rates)
     return ca.Function(
-        "model", [x, f_ext, payload, memory, vector, constant, dt],
+        "model", [x, rates, f_ext, payload, memory, vector, constant, dt],
         [record, packed, ca.vertcat(verdict, _ratios(k, numbers, dt))],
     )  # fmt: skip
 
@@ -118,7 +119,7 @@ def _of_point_mass(kind: Kind) -> Any:
     mass = ca.diag(ca.vertcat(tip, tip, ca.SX.zeros(n)))
     push = force - f_ext - tip * numbers.gravity
     packed = discretisation(n, point=True)(
-        k, g, push, x, ca.vertcat(numbers.drag, dt), mass, ca.SX.zeros((2 + n) ** 2, 2 + n)
+        k, g, push, x, ca.vertcat(numbers.drag, dt), mass, ca.SX.zeros((2 + n) ** 2, 2 + n), ca.SX.zeros(n)
     )
     return ca.Function("discretise", [force, k, g, f_ext, payload, x, vector, dt], [packed, _ratios(k, numbers, dt)],
                        {"cse": True})  # fmt: skip

@@ -132,16 +132,21 @@ def foresight_graph(
     corrected = _corrected(given, n, commanded=commanded)
     x, force = corrected[:-2], corrected[-2:]
     graph_of = model_list if inline else model_graph
-    found = [_place(graph_of, model, given, x, force, 0, rounding, last=count == 1)]
+    found: list[tuple[Any, ...]] = []
     ahead = arriving = x
     for j in range(places.delay):
-        ahead = _moved(found[j][1], ahead, given.on_the_way[:, j], n)
+        u = given.on_the_way[:, j]
+        found.append(_place(graph_of, model, given, ahead, u, force, j, rounding, last=False))
+        ahead = _moved(found[j][1], ahead, u, n)
         arriving = ahead if j == 0 else arriving
-        found.append(_place(graph_of, model, given, ahead, force, j + 1, rounding, last=j + 1 == count - 1))
     due, rates = _due(given, places.horizon) if commanded else (ca.DM(n, places.horizon + 1), ca.DM(n, 1))
-    for j in range(places.delay + 1, count):
-        there = given.path[:, j - places.delay - 1] - ca.vertcat(ca.DM(4, 1), due[:, j - places.delay])
-        found.append(_place(graph_of, model, given, there, force, j, rounding, last=j == count - 1))
+    planned = [given.path[:, j] - ca.vertcat(ca.DM(4, 1), due[:, j + 1]) for j in range(places.models - 1)]
+    line, u = [ahead, *planned], given.inputs[:, 0]
+    for j, there in enumerate(line):
+        if j + 1 < len(line):  # else the last rates stay
+            u = (line[j + 1][4:] - there[4:]) / given.dt
+        at = places.delay + j
+        found.append(_place(graph_of, model, given, there, u, force, at, rounding, last=at == count - 1))
     records, models, good, states_of = (ca.horzcat(*columns) for columns in zip(*found, strict=True))
     shift, target_record, target_good = _shifted(target, given, force, n, rounding)
     states = given.states + ca.vertcat(
@@ -231,6 +236,7 @@ def _place(
     model: StepModel,
     given: Any,
     x: Any,
+    rates: Any,
     force: Any,
     j: int,
     rounding: float,
@@ -240,7 +246,7 @@ def _place(
     """Record and linear model of place j, whether its rods have followed, and x, where it is."""
     memory = given.records[: sizes(model).memory, j]
     graph = graph_of(model, 2 if last else 1)
-    record, packed, verdict = graph(x, force, given.payloads[j], memory, given.numbers, given.mass, given.dt)
+    record, packed, verdict = graph(x, rates, force, given.payloads[j], memory, given.numbers, given.mass, given.dt)
     return record, packed, _grade(verdict, [*_verdict(rounding), STIFFEST, STIFFEST]), x
 
 
