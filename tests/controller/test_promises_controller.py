@@ -17,7 +17,8 @@ from pcr_mpc import (
     solve_statics,
 )
 from pcr_mpc.loop.controller.tracking import TrackingController
-from pcr_mpc.loop.demand.feed_forward import _momentum, feed_forward
+from pcr_mpc.loop.demand.feed_forward import feed_forward
+from pcr_mpc.loop.demand.moving_rods import _momentum
 from pcr_mpc.loop.parts.assembled import motor_limits
 from pcr_mpc.loop.parts.controllers import HoldMotors
 from pcr_mpc.loop.parts.target import MotorTarget
@@ -241,7 +242,7 @@ def test_the_rods_push_the_tip_by_the_slope_of_their_kinetic_energy(pair, centre
         return w @ plant.mass(p, centre.q)[0] @ w / 2
 
     poses = together([solve_statics(heavy, centre.p, centre.q, guess=centre)])
-    momentum, push, *_ = _momentum(poses, centre, "condensed", np.zeros(1), v[None], rates[None])
+    _, momentum, push = _momentum(poses, centre, "condensed", v[None], rates[None])
     by_p, by_v = np.empty(2), np.empty(2)
     for axis, h in enumerate(1e-5 * np.eye(2)):
         by_p[axis] = (energy(centre.p + h, v) - energy(centre.p - h, v)) / 2e-5

@@ -46,7 +46,10 @@ def check_scene(scene: Scene) -> list[str]:
 
 def reference_of(scene: Scene, pose: Equilibrium) -> InverseDynamics:
     """Inverse dynamics of the reference with the rods' inertia that the scene's controller knows."""
-    return feed_forward(scene, scene.robot, pose, 0, scene.tuning.model.inertia if scene.tuning else "none")
+    if scene.tuning is None or scene.tuning.model.inertia == "none":
+        return feed_forward(scene, scene.robot, pose, 0)
+    # What the rods' mass takes at the end depends on what comes then, which the controller looks at, too.
+    return feed_forward(scene, scene.robot, pose, scene.tuning.horizon, scene.tuning.model.inertia)
 
 
 def reference_excess(
