@@ -56,6 +56,10 @@ def test_a_late_call_where_the_tip_is_expected_out_of_reach(live, centre):
     assert set(loop.events) == {"late", "measurement"}
     # The motors keep their limits until the tip has said the same for long enough, and is believed.
     assert loop.run(35).events[-1] in ("resumed", "reinitialised")
+    # Then rods and plan begin where the robot is, too: neither leads anywhere from where it was not.
+    said = len(loop.events)
+    assert loop.run(100).events[said:] == []
+    assert loop.error(live._scene.trajectory, 100) < 0.1
 
 
 def test_calls_that_do_not_go_on_repeat_the_rates(live, centre):

@@ -23,6 +23,7 @@ from ...linearisation.linear_model import LinearModel, LinearModels
 from ...linearisation.pose_limits import LimitWatch
 from ...plant.robot import Robot
 from ...plant.statics.equilibrium import Equilibrium
+from ...plant.statics.held_tip import solve_statics
 from ..demand.track import Track
 from ..hardware.past import PastEstimates
 from ..learning.learner import Learner
@@ -248,9 +249,19 @@ class ControlStep:
             expected[:4] += change[:4]
             foresight.force[:] += change[4:]
             found.p = None  # it is done with
+        if found.velocity is not None:
+            self._begin_rods_anew(expected)
         p = expected[:2] if found.p is None else found.p
         foresight.measured[:] = [*p, *(expected[4:] if found.q is None else found.q)]
         return found.events
+
+    def _begin_rods_anew(self, x: np.ndarray) -> None:
+        """Follow the rods to where the robot is after all: a wrong estimate, and a plan from there, lead anywhere."""
+        self.plan = None
+        with suppress(PCRError, ValueError):  # else the step says why there is no linear model
+            pose = solve_statics(self.robot, x[:2], x[4:], guess=self.pose)
+            self._predicts = LinearModels.of([self.foresight.follow(x, pose)])
+            self.watch.reset(x, pose)
 
     def _tell(self, k: int, foresight: Foresight) -> None:
         """Write the rest of what is known in period k into the graph that looks ahead."""

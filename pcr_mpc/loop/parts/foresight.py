@@ -12,7 +12,7 @@ from ...buffered import BufferedFunction
 from ...compiled import fastest, has_compiler
 from ...control.qp.program import QuadraticProgram, Reference, constraint_matrix
 from ...errors import ConvergenceError, PCRError
-from ...linearisation.linear_model import LinearModels
+from ...linearisation.linear_model import LinearModel, LinearModels
 from ...linearisation.linearise import linearise
 from ...plant.motion.plant import Plant
 from ...plant.motion.step_graph import StepModel
@@ -200,6 +200,13 @@ class Foresight:
         for name in ("lead", "moves", "lags"):
             self.inputs[name][:] = 0.0
         self._records[:] = self._plant.record
+
+    def follow(self, x: np.ndarray, pose: Equilibrium) -> LinearModel:
+        """All rods are in ``pose`` at the state x, and nothing else changes; return the linear model there."""
+        self._plant.reset(x, pose)
+        model = linearise(self._plant, x, np.zeros(len(x) - 4), self._period, self.force)
+        self._records[:] = self._plant.record
+        return model
 
     def pose(self, x: np.ndarray) -> Equilibrium:
         """Equilibrium at the state x at which the next period will begin, following the branch."""
