@@ -15,6 +15,7 @@ from .errors import ModelError, described, number_problem
 _REQUIRED: Any = object()
 # Likeness of two words from which one may be meant for the other.
 _NEAR = 0.75
+_TABLES = ".csv", ".tsv", ".txt", ".npz", ".json"
 _WORD = 4  # letters of what may be meant as a part of a longer name
 # What people look for in a robot or scene and the toolkit does not describe, by how its name begins.
 _UNDESCRIBED = {
@@ -262,6 +263,12 @@ def read_toml(path: str | Path) -> Table:
     except UnicodeDecodeError as error:
         raise ModelError(f"{path}: is not UTF-8 text ({error}); save it as UTF-8", file=str(path)) from error
     except (ValueError, RecursionError) as error:
+        if path.suffix.lower() in _TABLES:
+            raise ModelError(
+                f"{path}: is a table, not a scene, robot or tuning; a path goes into [reference] of a scene: "
+                'kind = "file", file = its name',
+                file=str(path),
+            ) from None
         raise ModelError(f"{path}: {error}", file=str(path)) from error
     return Table(path, "", data)
 

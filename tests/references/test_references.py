@@ -347,6 +347,8 @@ def test_corners_that_do_not_fit_say_which_would():
     Polygon(SQUARE, 1e-3 * largest, 0.1)
     with pytest.raises(ModelError):
         Polygon(SQUARE, 1.001e-3 * largest, 0.1)
+    with pytest.raises(ModelError, match=r"^radius is 5 m \(millimetres\? give metres\): the leg from"):
+        Polygon(SQUARE, 5.0, 0.1)
 
 
 def drift(t):

@@ -107,6 +107,9 @@ def test_a_tuning_without_a_period_has_the_scenes(files):
 
 
 def test_broken_and_missing_files(tmp_path):
+    (tmp_path / "path.csv").write_text("t_s,x_m,y_m\n0,0.1,0.2\n")
+    with pytest.raises(ModelError, match=r"path\.csv: is a table, not a scene"):
+        load_scene(tmp_path / "path.csv")
     with pytest.raises(ModelError, match="no such file"):
         load_robot(tmp_path / "none.toml")
     (tmp_path / "broken.toml").write_text("name = ")

@@ -150,8 +150,9 @@ class Rounded:
     def _require_turns(self, turns: np.ndarray, points: np.ndarray) -> None:
         for i in np.flatnonzero(np.abs(turns) > _SHARPEST):
             raise ModelError(
-                f"the path turns back at point {i % len(self.points)}, ({points[i][0]:g}, {points[i][1]:g}) m, which "
-                "no radius can round; let it come to rest there, or move the point",
+                f"radius is {self.radius:g} m, and the path turns back at point {i % len(self.points)}, "
+                f"({points[i][0]:g}, {points[i][1]:g}) m, which no radius can round; let it come to rest there, or "
+                "move the point",
                 key="radius",
             )
 
@@ -161,9 +162,11 @@ class Rounded:
         i = int((taken / sizes).argmax())
         if short[i] > _ROUNDING * sizes[i]:
             (x, y), (xx, yy) = points[i], points[i + 1]
+            units = " (millimetres? give metres)" if self.radius > sizes.sum() else ""
             raise ModelError(
-                f"the leg from ({x:g}, {y:g}) to ({xx:g}, {yy:g}) m is {1e3 * sizes[i]:.4g} mm long, and corners of "
-                f"radius {1e3 * self.radius:g} mm take {1e3 * taken[i]:.4g} mm of it; the largest radius that fits is "
+                f"radius is {self.radius:g} m{units}: the leg from ({x:g}, {y:g}) to ({xx:g}, {yy:g}) m is "
+                f"{1e3 * sizes[i]:.4g} mm long, and corners of radius {1e3 * self.radius:g} mm take "
+                f"{1e3 * taken[i]:.4g} mm of it; the largest radius that fits is "
                 f"{np.floor(1e6 * self.radius * sizes[i] / taken[i]) / 1e3:g} mm",
                 key="radius",
             )

@@ -235,7 +235,7 @@ def simulate(
         t = done * plant.dt
         events.append({"t": t, "kind": "failure", "message": what})
         raise SimulationError(
-            f"{scene.name} stopped at t = {t:.4f} s of {scene.duration} s: {what}", run=record(), t=t
+            f"{scene.name} stopped at t = {t:.4f} s of {scene.duration:g} s: {what}", run=record(), t=t
         ) from error
     return record()
 
