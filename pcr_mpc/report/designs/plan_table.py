@@ -8,10 +8,6 @@ from ..tables import table
 
 LIGHT = 0.01  # share of the rods in the mass that moves, below which nobody is told
 _RESOLUTION = 1e-3  # of a limit, between the points at which a plan keeps it
-_SLOWED = (
-    "slowed      all of it, until its limits are kept: it may take longer than it must;\n"
-    "            allow more of what is used most, or try other --cells"
-)
 _KNOWN = 'inertia = "condensed" under [model] in the scene\'s tuning lets the plan reckon with it'
 
 
@@ -34,7 +30,6 @@ def plan_table(summary: dict[str, Any]) -> str:
         f"path        {summary['length_mm']:.1f} mm, within {summary['deviation_mm']:.3g} mm of the reference's",
         f"top speed   {summary['top_speed_m_s']:.3g} m/s",
         *_rods_lines(summary),
-        *([_SLOWED] if summary.get("slowed") else []),
         "",
         table(("limit", "value", "unit", "most used [%]", "at [s]", "acts [% of time]"), rows),
         "",
@@ -52,7 +47,8 @@ def _rods_lines(summary: dict[str, Any]) -> list[str]:
     if rods is not None:
         return [
             f"{begin} ({rods['inertia']}); with it the motors are asked for",
-            f"            {_motors(rods)} at the control periods; the limits below are lowered for that",
+            f"            {_motors(rods)} at the control periods{_rods(rods)}",
+            "            the limits below are lowered for that",
         ]
     if share <= LIGHT:
         return []
@@ -62,6 +58,7 @@ def _rods_lines(summary: dict[str, Any]) -> list[str]:
         lines.append(f"            with it the motors cannot follow: {left_out['error']}")
     elif left_out is not None:
         lines.append(f"            with it the motors are asked for {_motors(left_out)} at the control periods")
+        lines[-1] += _rods(left_out)
     return [*lines, f"            {_KNOWN}"]
 
 
@@ -71,6 +68,13 @@ def _motors(rods: dict[str, Any]) -> str:
         f"{rods['asked'][name]:.4g} of {rods['limits'][name]:.4g} {unit}"
         for name, unit in (("rate_rad_s", "rad/s"), ("rate_change_rad_s2", "rad/s^2"), ("torque_Nm", "N m"))
     )
+
+
+def _rods(rods: dict[str, Any]) -> str:
+    """What is used of the limits on poses with the rods' mass."""
+    names = {"strains": "strain", "rod_margin": "the rod margin", "stiffness": "stiffness"}
+    used = [f"{100 * rods['shares'][kind]:.1f} % of {name}" for kind, name in names.items() if rods["shares"].get(kind)]
+    return f"; {', '.join(used)}" if used else ""
 
 
 def _verdict(summary: dict[str, Any]) -> str:

@@ -17,6 +17,7 @@ from .motion import Motion
 
 _MOST_STEPS = 12
 _LARGEST_STEP = 0.15  # rad
+_MOST_SWEEPS, _SETTLED = 8, 1e-4  # of the angles of more than two motors along the path, and by how little they change
 _STEP = 1e-6  # of the motors, in radians, and of the tip, in rod lengths, for differences
 
 
@@ -137,12 +138,30 @@ def balanced(
     )
 
 
-def stood(moved: Motion, pose: Equilibrium, q: np.ndarray, near: Equilibria | None, tolerance: float) -> Stand:
-    """Solve the rods for the forces of a motion; see `balanced`."""
-    poses, q = balanced(pose, moved.path[0], moved.force[0].value, q, near, tolerance)
-    levers = _levers(poses.dforce_dq)
-    p1 = moved.path[1]
-    q1 = np.einsum("mij,mj->mi", levers, moved.force[1].value - np.einsum("mij,mj->mi", poses.dforce_dp, p1))
+def stood(
+    moved: Motion,
+    pose: Equilibrium,
+    q: np.ndarray,
+    near: Equilibria | None,
+    tolerance: float,
+    x: np.ndarray | None = None,
+) -> Stand:
+    """Solve the rods for the forces of a motion; see `balanced`.
+
+    With more than two motors there are many angles that do. At the points ``x`` of all the way they are those of least
+    motion from the first ones on, q' = G^+ (F' - K p'); at others, where none are given, those nearest to q.
+    """
+    p, p1, force, force1 = moved.path[0], moved.path[1], moved.force[0].value, moved.force[1].value
+    for _ in range(_MOST_SWEEPS):
+        poses, q = balanced(pose, p, force, q, near, tolerance)
+        levers = _levers(poses.dforce_dq)
+        q1 = np.einsum("mij,mj->mi", levers, force1 - np.einsum("mij,mj->mi", poses.dforce_dp, p1))
+        if x is None or q.shape[1] == 2:
+            break
+        least = q[0] + make_interp_spline(x, q1, k=3).antiderivative()(x)
+        if np.abs(least - q).max() < _SETTLED:
+            break
+        q, near = least, poses
     return Stand(pose, poses, q, levers, _along(pose, poses, p1, q1, levers))
 
 

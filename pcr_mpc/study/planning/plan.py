@@ -18,13 +18,13 @@ from .along_path.legs import joined
 from .along_path.meshing import repaced
 from .along_path.pace import spline_of, times
 from .along_path.path import TipPath, paths_of
-from .along_path.refining import ALLOWED, Refined, refined
+from .along_path.refining import ALLOWED, refined
 from .along_path.starting import STATICS, evened, resting, started, where
-from .along_path.timing import Problem
+from .along_path.timing import Problem, Timing
 from .freely.free import Freed, freed, way_points
 from .limits import PlanLimits, uses
 from .motion import Carrier
-from .rods_mass import asked_of_motors, with_rods
+from .rods_mass import asked_with_rods, with_rods
 from .timed_path import Paced, RodsMass, TimedPath
 
 _CELL = 1e-2  # s
@@ -131,10 +131,9 @@ def rods_left_out(scene: Scene, planned: TimedPath) -> RodsMass:
         With it the motors cannot follow at all.
     """
     assert scene.tuning is not None
-    inertia = "condensed"
-    knowing = replace(scene, tuning=replace(scene.tuning, model=replace(scene.tuning.model, inertia=inertia)))
+    knowing = replace(scene, tuning=replace(scene.tuning, model=replace(scene.tuning.model, inertia="condensed")))
     carried = carrier_of(scene, _span(scene)).mass - scene.robot.tip_mass
-    return RodsMass(inertia, planned.limits, **asked_of_motors(knowing, planned, carried), rounds=1)
+    return asked_with_rods(knowing, planned, planned.limits, carried)
 
 
 def _span(scene: Scene) -> float:
@@ -166,7 +165,7 @@ def _planned(
     if freely is not None:
         found = freed(timing, freely[0], wanted, ALLOWED)
         return _free_result(name, found, freely[1], problem.limits, iterations + found.iterations)
-    return _result(name, refined(timing, counted), path.deviation, iterations)
+    return _result(name, *refined(timing, counted), path.deviation, iterations)
 
 
 def carrier_of(scene: Scene, span: float) -> Carrier:
@@ -217,8 +216,7 @@ def _distance(paths: list[TipPath], tips: np.ndarray) -> float:
     return away + max(path.deviation for path in paths)
 
 
-def _result(name: str, found: Refined, deviation: float, iterations: int) -> TimedPath:
-    timing, fine = found.timing, found.fine
+def _result(name: str, timing: Timing, fine: Timing, deviation: float, iterations: int) -> TimedPath:
     moved, turned = fine.moved, fine.turned
     return TimedPath(
         name,
@@ -234,7 +232,6 @@ def _result(name: str, found: Refined, deviation: float, iterations: int) -> Tim
         kinds=tuple(use.limit for use in fine.uses),
         shares=fine.shares,
         iterations=iterations,
-        slowed=found.slowed,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from ...errors import ConvergenceError, PCRError
 from ...loop.demand.feasibility import reference_demand, reference_of
@@ -12,7 +13,7 @@ from ...loop.scene.scene import Scene
 from .limits import PlanLimits
 from .timed_path import RodsMass, TimedPath
 
-_KINDS = {"rate": "rate_rad_s", "acceleration": "rate_change_rad_s2", "torque": "torque_Nm"}
+_MOTORS = "rate_rad_s", "rate_change_rad_s2", "torque_Nm"
 _ROUNDS = 8
 _SPARE = 5e-4  # by which a limit is lowered more than it must be
 _REST = 5  # periods
@@ -46,26 +47,38 @@ def with_rods(
         planned = planned_for(lowered)
         if inertia == "none":
             return planned
-        asked = asked_of_motors(scene, planned, carried)
-        shares = {kind: value / getattr(limits, kind) for kind, value in asked.items()}
+        asked = asked_with_rods(scene, planned, limits, carried)
+        shares = asked.shares
         if max(shares.values()) <= 1.0:  # what is beyond by however little, `check_scene` refuses
-            return replace(planned, rods=RodsMass(inertia, limits, **asked, rounds=rounds))
-        lowered = replace(
-            lowered,
-            **{kind: getattr(lowered, kind) * (1.0 - _SPARE) / share for kind, share in shares.items() if share > 1.0},
-        )
+            return replace(planned, rods=replace(asked, rounds=rounds))
+        lowered = _lowered(lowered, {kind: (1.0 - _SPARE) / share for kind, share in shares.items() if share > 1.0})
     kind, share = max(shares.items(), key=lambda item: item[1])
     raise ConvergenceError(
         f"with the inertia of its rods ({inertia}) the plan of {scene.name} still asks for {share:.4g} times the "
         f"limit on {kind} after {_ROUNDS} plans; lower the scene's limits",
         residual=share - 1.0,
         iterations=_ROUNDS,
-        last=asked[kind],
+        last=share,
     )
 
 
-def asked_of_motors(scene: Scene, planned: TimedPath, carried: float) -> dict[str, float]:
-    """Largest rate, change of rate and torque of any motor with the inertia that the scene's controller knows."""
+def _lowered(limits: PlanLimits, factors: dict[str, float]) -> PlanLimits:
+    """Limits of which so much is left; of margins, so much of what they allow."""
+    changed: dict[str, Any] = {}
+    for kind, factor in factors.items():
+        value = getattr(limits, kind)
+        if kind == "strains":
+            changed[kind] = tuple(factor * one for one in value)
+        elif kind == "rod_margin":
+            changed[kind] = 1.0 - factor * (1.0 - value)
+        else:
+            changed[kind] = value / factor if kind == "stiffness" else factor * value
+    return replace(limits, **changed)
+
+
+def asked_with_rods(scene: Scene, planned: TimedPath, limits: PlanLimits, carried: float) -> RodsMass:
+    """What a plan asks for, beside those limits, with the inertia that the scene's controller knows."""
+    assert scene.tuning is not None
     robot = scene.robot
     count = math.ceil(planned.duration / scene.period) + _REST
     loaded = replace(
@@ -76,7 +89,22 @@ def asked_of_motors(scene: Scene, planned: TimedPath, carried: float) -> dict[st
         robot=replace(robot, tip_mass=robot.tip_mass + carried) if carried else robot,
     )
     try:
-        demand = reference_demand(loaded, reference_of(loaded, scene.start()))
+        reference = reference_of(loaded, scene.start())
     except PCRError as error:
-        raise type(error)(f"with the inertia of its rods: {error}", **error.details) from None
-    return {kind: float(demand[name]["asked"]) for kind, name in _KINDS.items()}
+        raise type(error)(
+            f"with the inertia of its rods, which limits are lowered for only after a first plan: {error}; "
+            "or give the plan lower limits",
+            **error.details,
+        ) from None
+    demand = reference_demand(loaded, reference)
+    rate, acceleration, torque = (float(demand[name]["asked"]) for name in _MOTORS)
+    return RodsMass(
+        scene.tuning.model.inertia,
+        limits,
+        rate,
+        acceleration,
+        torque,
+        strains=tuple(reference.strains.max(axis=0).tolist()),
+        rod_margin=float(reference.rod_margin.min()),
+        stiffness=float(reference.stiffness.min()),
+    )

@@ -76,7 +76,7 @@ class Paced(Move):
 
 @dataclass(frozen=True)
 class RodsMass:
-    """What a plan asks of the motors with the rods' inertia, at the control periods.
+    """What a plan asks for with the rods' inertia, at the control periods.
 
     Attributes
     ----------
@@ -86,6 +86,10 @@ class RodsMass:
         That are kept with it.
     rate, acceleration, torque : float
         Largest of any motor [rad/s], [rad/s^2], [N m].
+    strains : tuple of float
+        Largest of each rod; NaN where no thickness is known.
+    rod_margin, stiffness : float
+        Least of any rod, NaN where it is not known, and of the tip [N/m].
     rounds : int
         Plans that were made.
     """
@@ -95,13 +99,29 @@ class RodsMass:
     rate: float
     acceleration: float
     torque: float
-    rounds: int
+    strains: tuple[float, ...]
+    rod_margin: float
+    stiffness: float
+    rounds: int = 1
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Of the limits, by their names in `PlanLimits`: 1 is all of it."""
+        limits = self.limits
+        found = {kind: getattr(self, kind) / getattr(limits, kind) for kind in ("rate", "acceleration", "torque")}
+        found["stiffness"] = limits.stiffness / self.stiffness if self.stiffness > 0.0 else math.inf
+        if limits.strains:
+            found["strains"] = max(np.nan_to_num(np.array(self.strains) / limits.strains).tolist())
+        if math.isfinite(self.rod_margin) and math.isfinite(limits.rod_margin):
+            found["rod_margin"] = (1.0 - self.rod_margin) / (1.0 - limits.rod_margin)
+        return found
 
     def summary(self) -> dict[str, Any]:
-        """Ready for JSON: what is asked of the motors with inertia, and what is allowed."""
+        """Ready for JSON: what is asked of the motors with inertia, what is allowed, and the shares of all limits."""
         return {
             "inertia": self.inertia,
             "plans": self.rounds,
+            "shares": self.shares,
             "asked": {"rate_rad_s": self.rate, "rate_change_rad_s2": self.acceleration, "torque_Nm": self.torque},
             "limits": {
                 "rate_rad_s": self.limits.rate,
@@ -138,8 +158,6 @@ class TimedPath(Frozen):
     shares : ndarray, shape (limits, K)
         Largest share of each that is used: 1 is all of it.
     iterations : int
-    slowed : bool
-        Whether all of it had to be made slower to keep its limits: it may take longer than it must.
     rods : RodsMass or None
         With the rods' inertia, if the plan reckons with it; ``limits`` are then lowered.
     """
@@ -157,7 +175,6 @@ class TimedPath(Frozen):
     kinds: tuple[str, ...]
     shares: np.ndarray
     iterations: int
-    slowed: bool = False
     rods: RodsMass | None = None
 
     @property
@@ -219,6 +236,5 @@ class TimedPath(Frozen):
             "checked": len(self.t),
             "largest_excess": self.excess,
             "iterations": self.iterations,
-            "slowed": self.slowed,
             "rods": None if self.rods is None else self.rods.summary(),
         }

@@ -84,6 +84,12 @@ def test_what_cannot_be_planned_is_said_with_numbers(scene, change, error, messa
         plan_timing(replace(scene, **change))
 
 
+def test_a_speed_that_would_take_hours_is_refused_for_that(scene):
+    """To rest on the path is no trouble."""
+    with pytest.raises(InfeasibleError, match=r"\(tip speed\) even if all of the path takes 1e\+04 s"):
+        plan_timing(scene, limits=PlanLimits.of_scene(scene, tip_speed=1e-6))
+
+
 def test_a_torque_that_does_not_hold_the_tip_is_said(scene):
     limits = replace(PlanLimits.of_scene(scene), torque=0.7)
     with pytest.raises(InfeasibleError, match=r"to rest there takes .* N m, where 0.7 N m are allowed") as caught:
@@ -127,6 +133,7 @@ def test_the_command_writes_a_path_and_a_picture(tmp_path, capsys):
     # Two rods of 5.6 g beside 250 g: less than all of them, for they are clamped at one end.
     assert 0.005 < found["share_of_rods"] < 11.1 / 261.1
     left_out = {"asked": dict.fromkeys(("rate_rad_s", "rate_change_rad_s2", "torque_Nm"), 2.0)}
+    left_out["shares"] = {"rate": 4 / 3, "strains": 0.5}
     left_out["limits"] = dict.fromkeys(left_out["asked"], 1.5)
     told = plan_table(found | {"share_of_rods": 0.38, "rods_left_out": left_out})
     assert "38 % of the mass that moves, left out" in told

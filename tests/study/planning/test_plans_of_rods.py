@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from pcr_mpc import (
+    Blended,
     PlanLimits,
+    Spline,
     check_scene,
     load_scene,
     make_controller,
@@ -17,6 +19,7 @@ from pcr_mpc import (
 from pcr_mpc.report.designs.plan_table import plan_table
 from pcr_mpc.study.planning import rods_mass
 from pcr_mpc.study.planning.plan import rods_left_out
+from pcr_mpc.study.planning.timed_path import RodsMass
 from tests.conftest import MODELS
 from tests.study.planning.by_statics import motors
 
@@ -29,9 +32,9 @@ def test_limits_are_lowered_until_with_the_rods_mass_none_is_exceeded_by_anythin
 
     def asked(*_):
         share = 1.0005 * kept[-1].acceleration / limits.acceleration
-        return {"rate": 1.0, "acceleration": share * limits.acceleration, "torque": 0.1}
+        return RodsMass("condensed", limits, 1.0, share * limits.acceleration, 0.1, (math.nan, math.nan), 0.5, 20.0)
 
-    monkeypatch.setattr(rods_mass, "asked_of_motors", asked)
+    monkeypatch.setattr(rods_mass, "asked_with_rods", asked)
     found = rods_mass.with_rods(heavy, limits, 0.0, lambda lowered: kept.append(lowered) or planned)
     assert len(kept) == found.rods.rounds == 2
     assert found.rods.acceleration <= limits.acceleration
@@ -77,3 +80,17 @@ def test_rods_with_weight_are_planned_for_by_shooting(scene):
     assert np.abs(np.diff(q, axis=0)).max() / t[1] <= 1.001 * heavy.robot.rate_limit
     assert np.abs(np.diff(q, 2, axis=0)).max() / t[1] ** 2 <= 1.001 * heavy.robot.acceleration_limit
     assert np.abs(q - scene.start().q).max() > 0.1
+
+
+def test_more_motors_than_two_turn_at_the_rates_that_the_plan_says():
+    """Of many angles those of least motion, found in small steps: their rates and changes keep the limits, too."""
+    scene = load_scene(MODELS / "scenes" / "three_rods.toml")
+    ways = ((0.0, 0.0), (0.04, 0.04), (0.08, 0.0), (0.04, -0.04), (0.0, 0.01), (-0.05, 0.03))
+    points = tuple(map(tuple, scene.start().p + np.array(ways)))
+    scene = replace(scene, tuning=None, trajectory=Blended(Spline(points, speed=0.1)))
+    planned = plan_timing(scene, cells=40)
+    t = np.linspace(0.0, planned.duration, 2001)
+    rates = np.diff([eq.q for eq in motors(scene.robot, planned, t, scene.start())], axis=0) / t[1]
+    assert 0.99 < np.abs(planned.rates).max() / scene.robot.rate_limit <= 1.001
+    assert np.abs(rates).max() <= 1.002 * scene.robot.rate_limit
+    assert np.abs(np.diff(rates, axis=0)).max() / t[1] <= 1.004 * scene.robot.acceleration_limit

@@ -18,6 +18,7 @@ from pcr_mpc import (
     simulate,
 )
 from pcr_mpc.loop.references.trajectory import smooth_step
+from pcr_mpc.plant.statics.stability import least_rod_margin
 from pcr_mpc.report.designs.plan_table import plan_table
 from pcr_mpc.study.planning.along_path import refining
 from pcr_mpc.study.planning.along_path.course import paced
@@ -35,7 +36,6 @@ NO_MOTORS = {"rate": 1e6, "acceleration": 1e12, "torque": 1e3}
 def test_limits_are_kept_at_ten_times_the_grid(points_scene, planned):
     """Angles found one by one, rates and their change by differences of the angles alone."""
     assert planned.excess <= 1e-3
-    assert not planned.slowed
     assert "may take longer than it must" not in plan_table(planned.summary())
     scene, robot = points_scene, points_scene.robot
     t = np.linspace(0.0, planned.duration, 10 * planned.grid + 1)
@@ -177,7 +177,7 @@ def test_slopes_are_those_of_differences(scene, pair):
     rng = np.random.default_rng(0)
     (path,) = paths_of(scene.trajectory, 0.8, 5e-5)
     limits = replace(PlanLimits.of_scene(scene), tip_speed=1.0, tip_acceleration=5.0, tip_jerk=200.0)
-    limits = replace(limits, stiffness=50.0, rod_margin=0.38)  # so near that their slopes are computed
+    limits = replace(limits, stiffness=50.0, rod_margin=0.7)  # so near that their slopes are computed
     problem = Problem(paced(path), scene.start(), Carrier(pair.tip_mass, pair.drag, np.zeros(2)), limits)
     x, c = points(20, 6), constant_pace(20, 0.6).c
     c = c * (1.0 + 0.2 * np.sin(np.arange(len(c))))
@@ -201,20 +201,27 @@ def test_what_is_left_of_a_limit_is_left_on_both_sides():
     assert high.tolist() == [2.98, 2.0, np.inf]
 
 
-@pytest.mark.slow
-def test_margins_and_torque_limit_too(scene):
-    """A margin that the fastest motion does not leave is kept, and takes time."""
-    limits = PlanLimits.of_scene(scene)
-    free = plan_timing(scene, limits=limits, cells=40)
-    used = dict(zip(free.kinds, free.shares.max(axis=1), strict=True))
-    least = 1.0 - 0.95 * used["rod margin"] * (1.0 - limits.rod_margin)
-    kept = plan_timing(
-        scene, limits=replace(limits, rod_margin=least, torque=0.97 * used["motor torque"] * 1.5), cells=40
-    )
-    assert kept.duration > 1.001 * free.duration
-    assert kept.excess <= 1e-3
-    shares = dict(zip(kept.kinds, kept.shares.max(axis=1), strict=True))
-    assert max(shares["rod margin"], shares["motor torque"]) > 0.99
+def test_a_margin_that_the_fastest_motion_does_not_leave_is_kept(points_scene):
+    """By rods that are found one by one; it takes time, and is no nearer than it must be.
+
+    Of a heavy tip on quick motors: elsewhere the shipped robot comes nearest to a snap where it rests.
+    """
+    line = Blended(Spline(((-0.1, 0.3), (0.1, 0.3)), speed=0.2))
+    robot = replace(points_scene.robot, tip_mass=1.0, acceleration_limit=2e3)
+    scene = replace(points_scene, robot=robot, trajectory=line, start_tip=(-0.1, 0.3))
+    limits = replace(PlanLimits.of_scene(scene), torque=5.0, strains=(), rod_margin=0.05)
+
+    def least(planned):
+        t = np.linspace(0.0, planned.duration, 401)
+        return min(least_rod_margin(eq) for eq in motors(robot, planned, t, scene.start()))
+
+    fast = plan_timing(scene, limits=limits, cells=40)
+    # Far from its limit it is good to 1 %.
+    said = 0.95 * fast.shares[fast.kinds.index("rod margin")].max()
+    assert said == pytest.approx(1.0 - least(fast), rel=0.01)
+    kept = plan_timing(scene, limits=replace(limits, rod_margin=least(fast) + 0.03), cells=40)
+    assert least(fast) + 0.0295 < least(kept) < least(fast) + 0.031
+    assert kept.duration > 1.005 * fast.duration
 
 
 @pytest.mark.slow
@@ -238,19 +245,21 @@ def test_a_strain_that_the_material_does_not_bear_is_kept_off(scene):
 
 @pytest.mark.slow
 def test_a_torque_that_is_hardly_more_than_rest_takes_is_kept(points_scene):
-    """The programs end where a change of rate is exceeded: the motion is made slower, and then faster again."""
+    """It takes much more time to ask for less of it than for less of a rate: programs must charge more for its excess.
+
+    Made slower all along until it kept its limits, as it once was, it took 1.60 s; 1.16 s with all the torque.
+    """
     points = ((-0.05, 0.2), (-0.045, 0.26), (-0.01, 0.23), (0.015, 0.275), (0.05, 0.265), (0.03, 0.225), (0.055, 0.195),
               (0.0, 0.185))  # fmt: skip
     scene = replace(points_scene, trajectory=Blended(Spline(points, speed=0.1)))
-    planned = plan_timing(scene, limits=replace(PlanLimits.of_scene(scene), torque=0.95))
-    assert planned.slowed
-    assert "may take longer than it must" in plan_table(planned.summary())
+    planned = plan_timing(scene, limits=replace(PlanLimits.of_scene(scene), torque=0.93))
+    assert planned.duration < 1.3
     assert planned.excess <= 1e-3
     t = np.linspace(0.0, planned.duration, 3001)
     poses = motors(scene.robot, planned, t, scene.start())
     rates = np.diff([eq.q for eq in poses], axis=0) / t[1]
     changes = np.diff(rates, axis=0, prepend=0.0, append=0.0) / t[1]
-    assert 0.99 < max(np.abs(eq.motor_torque).max() for eq in poses) / 0.95 <= 1.001
+    assert 0.99 < max(np.abs(eq.motor_torque).max() for eq in poses) / 0.93 <= 1.001
     assert np.abs(rates).max() <= 1.001 * scene.robot.rate_limit
     assert np.abs(changes).max() <= 1.001 * scene.robot.acceleration_limit
 

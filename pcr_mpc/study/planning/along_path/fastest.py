@@ -19,7 +19,9 @@ from .pace import local_basis, quadrature, unit_splines
 from .program import LinearProgram
 from .timing import Timing, evaluated
 
-_PENALTY = 1.0  # of log duration for exceeding a limit by all of it; slower motion buys it back for less
+# Of log duration for exceeding a limit by all of it. Slower motion buys rates and their changes back for less; what is
+# taken at rest already, such as a torque, may cost more: as long as a program would rather exceed it, that is raised.
+_PENALTY, _RAISED, _MOST_PENALTY = 1.0, 4.0, 1e3
 _CORRECTIONS = 2
 _ENOUGH, _GOOD, _POOR = 0.8, 0.6, 0.3  # of the predicted gain: no correction, a wider and a narrower trust region
 _WIDER, _NARROWER = 1.6, 0.4
@@ -61,15 +63,20 @@ def faster(
     ConvergenceError
         The linear program was not solved.
     """
-    basis, program = _Basis(timing), None
+    basis, program, penalty = _Basis(timing), None, _PENALTY
     for _ in range(most):
         interrupt.check()
-        program = _Program(timing.with_slopes(), allowed, basis, program)
+        program = _Program(timing.with_slopes(), allowed, penalty, basis, program)
         # Limits are to be kept, however little time that takes.
         enough = min(tolerance, _REPAIRED * program.beyond) if program.beyond > _KEPT else tolerance
         found = None
         while found is None:
             predicted, found = program.step(trust, enough)
+            if program.left > _KEPT < program.beyond and penalty < _MOST_PENALTY:
+                penalty *= _RAISED
+                program.penalise(penalty)
+                found = None
+                continue
             if predicted < enough:
                 return timing
             if found is None:
@@ -105,7 +112,7 @@ class _Program:
     Parameters
     ----------
     timing : Timing
-    allowed : float
+    allowed, penalty : float
     basis : _Basis
         At its points.
     last : _Program, optional
@@ -115,10 +122,12 @@ class _Program:
     ----------
     beyond : float
         By how much more than what is allowed of a limit is used.
+    left : float
+        The same, as it is foreseen after the last step.
     """
 
-    def __init__(self, timing: Timing, allowed: float, basis: _Basis, last: _Program | None) -> None:
-        self._timing, self._allowed = timing, allowed
+    def __init__(self, timing: Timing, allowed: float, penalty: float, basis: _Basis, last: _Program | None) -> None:
+        self._timing, self._allowed, self._penalty, self.left = timing, allowed, penalty, 0.0
         pace = timing.pace
         # Unknowns: relative changes of the coefficients of b.
         by_own = -0.5 * (basis.weights * pace(basis.nodes) ** -1.5) @ basis.at_nodes
@@ -130,7 +139,7 @@ class _Program:
         self._both = np.concatenate([np.full(use.share.value.size, use.both) for use in timing.uses])
         self.beyond = self._excess(timing)
         self._reach = np.abs(self._slopes).sum(axis=1)
-        self._program = LinearProgram(np.append(self._gradient, _PENALTY))
+        self._program = LinearProgram(np.append(self._gradient, penalty))
         self._known = np.zeros((2, len(self._both)), dtype=bool)
         self._rows = np.empty(0, dtype=int), np.empty(0)
         if last is not None:
@@ -143,14 +152,15 @@ class _Program:
         for correction in range(_CORRECTIONS):
             change, excess = self._solved(rest, trust)
             if correction == 0:
-                predicted = -float(self._gradient @ change) + _PENALTY * (self.beyond - excess)
+                self.left = excess
+                predicted = -float(self._gradient @ change) + self._penalty * (self.beyond - excess)
                 if predicted < tolerance:
                     break
             trial = self._moved(change)
             if trial is None:
                 break
             gain = float(np.log(self._timing.duration / trial.duration))
-            gain += _PENALTY * (self.beyond - self._excess(trial))
+            gain += self._penalty * (self.beyond - self._excess(trial))
             if best is not None and gain <= best[0]:
                 break
             best = gain, trial
@@ -159,6 +169,11 @@ class _Program:
             # What the slopes do not know is taken for the same in the next try.
             rest = _stacked(trial) - (self._slopes * change[self._where]).sum(axis=1)
         return predicted, best if best is not None and best[0] > _LEAST_GAIN * predicted else None
+
+    def penalise(self, penalty: float) -> None:
+        """Charge so much for an excess from now on."""
+        self._penalty = penalty
+        self._program.charge(len(self._gradient), penalty)
 
     def _go_on_from(self, last: _Program) -> None:
         """Begin with the limits that held the last program's answer, and with that answer."""

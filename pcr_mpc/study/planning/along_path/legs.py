@@ -64,5 +64,4 @@ def joined(plans: Sequence[TimedPath]) -> TimedPath:
         rates=np.concatenate([planned.rates for planned in plans]),
         shares=np.concatenate([planned.shares for planned in plans], axis=1),
         iterations=sum(planned.iterations for planned in plans),
-        slowed=any(planned.slowed for planned in plans),
     )

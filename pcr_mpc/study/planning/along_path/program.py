@@ -52,6 +52,10 @@ class LinearProgram:
             entries = np.ascontiguousarray(values, dtype=float).ravel()
             self._demand(self._solver.addRows(len(low), low, high, entries.size, starts, places, entries))
 
+    def charge(self, unknown: int, cost: float) -> None:
+        """Give an unknown another cost."""
+        self._demand(self._solver.changeColCost(unknown, cost))
+
     def bound_rows(self, low: np.ndarray, high: np.ndarray) -> None:
         """Give all rows other bounds."""
         if len(low):

@@ -7,18 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ....errors import ConvergenceError, PCRError
+from ....errors import ConvergenceError
 from .fastest import faster
 from .meshing import FINE, points
-from .pace import cells_of, spline_of, times
-from .timing import EXACT, NEAR, Timing, evaluated
+from .pace import cells_of, times
+from .timing import EXACT, NEAR, Timing
 
 ALLOWED = 1.0 - 5e-4  # share of the limits that is used, so that they are kept between the points too
 _EXCESS = 1e-4  # over 1, on the fine grid, at which no more points are added
 _LARGEST_EXCESS = 1e-3
 _ROUNDS, _ITERATIONS, _GAIN = 14, 6, 1e-3  # of the duration
-_LONGER = (1.005, 1.01, 1.02, 1.03, 1.05, 1.1, 1.2, 1.5)  # times as long
-_AGAIN = 0.2  # by which share a coefficient may change then
 _APART = 1e-6  # nearer points are the same
 
 
@@ -34,24 +32,13 @@ class Checked(NamedTuple):
         return float(self.shares.max())
 
 
-class Refined(NamedTuple):
-    """A timing that keeps its limits between its points too.
-
-    Attributes
-    ----------
-    timing, fine : Timing
-        At the points where limits were kept, and on a grid ten times as fine.
-    slowed : bool
-        Whether all of it had to be made slower: it may take longer than it must.
-    """
-
-    timing: Timing
-    fine: Timing
-    slowed: bool
-
-
-def refined(timing: Timing, told: Callable[[float], None] | None = None) -> Refined:
+def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tuple[Timing, Timing]:
     """Add points where limits are exceeded between the points, until they are kept on a grid ten times as fine.
+
+    Returns
+    -------
+    timing, fine : Timing
+        At the points where limits were kept, and on the fine grid.
 
     Raises
     ------
@@ -64,7 +51,7 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> Refi
         fine, checked = checked_at(timing, between, tolerance, suspect=1.0 + _EXCESS)
         if checked.worst <= 1.0 + _EXCESS:
             if tolerance == EXACT:
-                return Refined(timing, fine, slowed=False)
+                return timing, fine
             per_cell, tolerance = FINE, EXACT if per_cell == FINE else NEAR
             continue
         x = with_points(timing.x, checked, ALLOWED)
@@ -76,46 +63,16 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> Refi
     between = points(cells_of(timing.pace), FINE)
     fine, checked = checked_at(timing, between, EXACT, suspect=1.0 + _EXCESS)
     if checked.worst <= 1.0 + _LARGEST_EXCESS:
-        return Refined(timing, fine, slowed=False)
-    # Nearer to rest less is asked for: where the programs find no way, all of it is made slower.
-    for longer in _LONGER:
-        try:
-            slow = _slower(timing, longer)
-            there, kept = checked_at(slow, between, EXACT, suspect=1.0 + _EXCESS)
-        except PCRError:
-            continue
-        if kept.worst <= 1.0 + _EXCESS:
-            return Refined(*_faster_again(slow, there, between, told), slowed=True)
+        return timing, fine
     limit, at = np.unravel_index(int(checked.shares.argmax()), checked.shares.shape)
     raise ConvergenceError(
         f"the plan still exceeds the limit on {fine.uses[limit].limit} by {100 * (checked.worst - 1):.3g} % at "
-        f"{times(fine.pace, checked.x)[at]:.4f} s after {_ROUNDS} refinements, and some limit in {_LONGER[-1]:g} times "
-        f"the time too; allow more of it, or take other cells than {cells_of(fine.pace)}",
+        f"{times(fine.pace, checked.x)[at]:.4f} s after {_ROUNDS} refinements; allow more of "
+        f"it, or take other cells than {cells_of(fine.pace)}",
         residual=checked.worst - 1.0,
         iterations=_ROUNDS,
         last=fine.pace.c,
     )
-
-
-def _faster_again(
-    slow: Timing, fine: Timing, between: np.ndarray, told: Callable[[float], None] | None
-) -> tuple[Timing, Timing]:
-    """Make a motion that keeps its limits faster, as long as it keeps them between the points too."""
-    for _ in range(_ROUNDS):
-        quick = faster(slow, most=1, trust=_AGAIN, allowed=ALLOWED, tolerance=_GAIN, told=told)
-        if quick is slow:
-            break
-        there, checked = checked_at(quick, between, EXACT, suspect=1.0 + _EXCESS)
-        if checked.worst > 1.0 + _LARGEST_EXCESS:
-            break
-        slow, fine = quick, there
-    return slow, fine
-
-
-def _slower(timing: Timing, longer: float) -> Timing:
-    """Return the same motion in so many times the time."""
-    pace = spline_of(longer**-2.0 * timing.pace.c)
-    return evaluated(timing.problem, pace, timing.x, timing.turned.q.value, timing.turned.poses)
 
 
 def checked_at(timing: Timing, x: np.ndarray, tolerance: float, *, suspect: float) -> tuple[Timing, Checked]:

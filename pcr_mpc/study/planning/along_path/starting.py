@@ -155,8 +155,11 @@ def _require_rest(still: Timing, path: TipPath) -> None:
     }.get(kind, f"uses {shares[limit, at]:.4g} times what is allowed")
     p = still.moved.path[0][at]
     s = float(still.problem.course.nominal(still.x[at]))
+    why = f"cannot be kept at any speed: to rest there {value} ({kind}); move the path, or allow more"
+    if kind in _POWERS:
+        why = f"{value} ({kind}) even if all of the path takes {still.duration:.3g} s; allow more"
     raise InfeasibleError(
-        f"{where(s, p)} cannot be kept at any speed: to rest there {value} ({kind}); move the path, or allow more",
+        f"{where(s, p)} {why}",
         status="infeasible at rest",
         limit=kind,
         share=float(shares[limit, at]),

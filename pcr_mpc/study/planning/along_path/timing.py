@@ -78,7 +78,7 @@ class Timing:
     def at(self, x: np.ndarray, tolerance: float = EXACT) -> Timing:
         """Return the same at other points."""
         q = np.asarray(CubicSpline(self.x, self.turned.q.value)(x))
-        return evaluated(self.problem, self.pace, x, q, self.near(x), tolerance)
+        return evaluated(self.problem, self.pace, x, q, self.near(x), tolerance, all_the_way=False)
 
     def with_slopes(self) -> Timing:
         """Return the same, and how it changes."""
@@ -97,6 +97,8 @@ def evaluated(
     q: np.ndarray,
     near: Equilibria | None = None,
     tolerance: float = NEAR,
+    *,
+    all_the_way: bool = True,
 ) -> Timing:
     """Evaluate a pace at the points x, without slopes; errors, ``near`` and ``tolerance`` as `balanced`.
 
@@ -104,9 +106,12 @@ def evaluated(
     ----------
     q : ndarray, shape (len(x), n)
         Guess [rad].
+    all_the_way : bool
+        Whether x leads along the path, so that more than two motors can be followed on it (see `stood`).
     """
     moved = _moving(problem, pace, x, slopes=False)
-    return _timing(problem, pace, x, moved, stood(moved, problem.pose, q, near, tolerance))
+    stand = stood(moved, problem.pose, q, near, tolerance, x if all_the_way else None)
+    return _timing(problem, pace, x, moved, stand)
 
 
 def on_stand(problem: Problem, pace: BSpline, x: np.ndarray, stand: Stand) -> Timing:
