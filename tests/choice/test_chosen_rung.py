@@ -120,7 +120,7 @@ def test_the_seven_scenes_carry_verified_rungs_of_their_own():
 @pytest.mark.parametrize("name", CHOSEN)
 def test_the_scenes_need_the_rungs_that_they_carry(name, monkeypatch):
     monkeypatch.setattr(
-        "pcr_mpc.study.choice.numbers_cost", lambda *_: None
+        "pcr_mpc.study.choice.choice.numbers_cost", lambda *_: None
     )  # tested elsewhere, and takes minutes if rods are shot
     scene = load_scene(SCENES / f"{name}.toml")
     found = choose(replace(scene, need=replace(scene.need, plant_step=1.0, control_step=10.0)))
