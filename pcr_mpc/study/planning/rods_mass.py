@@ -14,6 +14,7 @@ from .limits import PlanLimits
 from .timed_path import RodsMass, TimedPath
 
 _MOTORS = "rate_rad_s", "rate_change_rad_s2", "torque_Nm"
+_NAMES = {"rate": "motor rate", "acceleration": "change of rate", "strains": "strain", "rod_margin": "rod margin"}
 _ROUNDS = 8
 _SPARE = 5e-4  # by which a limit is lowered more than it must be
 _REST = 5  # periods
@@ -51,11 +52,14 @@ def with_rods(
         shares = asked.shares
         if max(shares.values()) <= 1.0:  # what is beyond by however little, `check_scene` refuses
             return replace(planned, rods=replace(asked, rounds=rounds))
-        lowered = _lowered(lowered, {kind: (1.0 - _SPARE) / share for kind, share in shares.items() if share > 1.0})
+        # What is left of an excess shows that the rods' part of it does not fall with the limit: then by as much again.
+        power = 1.0 if rounds == 1 else 2.0
+        factors = {kind: (1.0 - _SPARE) / share**power for kind, share in shares.items() if share > 1.0}
+        lowered = _lowered(lowered, factors)
     kind, share = max(shares.items(), key=lambda item: item[1])
     raise ConvergenceError(
         f"with the inertia of its rods ({inertia}) the plan of {scene.name} still asks for {share:.4g} times the "
-        f"limit on {kind} after {_ROUNDS} plans; lower the scene's limits",
+        f"limit on {_NAMES.get(kind, kind)} after {_ROUNDS} plans; lower the scene's limits",
         residual=share - 1.0,
         iterations=_ROUNDS,
         last=share,

@@ -40,6 +40,22 @@ def test_limits_are_lowered_until_with_the_rods_mass_none_is_exceeded_by_anythin
     assert found.rods.acceleration <= limits.acceleration
 
 
+def test_limits_are_lowered_more_where_what_the_rods_take_does_not_fall_with_them(scene, planned, monkeypatch):
+    """Half of it does not: in proportion to what is left the limit would be met only after dozens of plans."""
+    model = replace(scene.tuning.model, inertia="condensed")
+    heavy, limits = replace(scene, tuning=replace(scene.tuning, model=model)), PlanLimits.of_scene(scene)
+    kept = []
+
+    def asked(*_):
+        change = 0.6 * limits.acceleration + 0.45 * kept[-1].acceleration
+        return RodsMass("condensed", limits, 1.0, change, 0.1, (math.nan, math.nan), 0.5, 20.0)
+
+    monkeypatch.setattr(rods_mass, "asked_with_rods", asked)
+    found = rods_mass.with_rods(heavy, limits, 0.0, lambda lowered: kept.append(lowered) or planned)
+    assert found.rods.rounds <= 5
+    assert 0.87 < kept[-1].acceleration / limits.acceleration < 0.4 / 0.45
+
+
 @pytest.mark.slow
 def test_a_plan_reckons_with_the_rods_inertia_that_the_controller_knows(scene):
     """Of rods three times as heavy: where a plan without it asks for too much, one with it does not, and is slower."""
