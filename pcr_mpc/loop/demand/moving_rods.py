@@ -16,6 +16,7 @@ from ...plant.statics.equilibrium import Equilibrium
 from ...plant.statics.many_poses.equilibria import Equilibria
 
 _SHARE = 0.7  # of the force by which motors turn the tip, that the rods' mass may take at the fastest turns
+_LOOKED_AT = 200  # poses at most
 _POWERS = 5  # of the polynomials whose slopes are derivatives
 
 
@@ -48,8 +49,9 @@ class MovingRods:
 
     def __init__(self, poses: Equilibria, pose: Equilibrium, inertia: str, period: float) -> None:
         self._pose, self._inertia = pose, inertia
-        mass, _ = _masses(poses, pose, inertia)
-        alone = float(np.linalg.eigvals(mass[:, :2, 2:] @ np.linalg.pinv(poses.dforce_dq)).real.max())
+        some = poses.rows(np.unique(np.linspace(0, len(poses.q) - 1, _LOOKED_AT).astype(int)))
+        mass, _ = _masses(some, pose, inertia)
+        alone = float(np.linalg.eigvals(mass[:, :2, 2:] @ np.linalg.pinv(some.dforce_dq)).real.max())
         fastest = math.sqrt(_SHARE / alone) if alone > 0.0 else math.inf
         self._slopes, periods = _derivative(len(poses.q), period, fastest)
         self.width = periods * period
