@@ -90,8 +90,8 @@ def _buffered(n: int, point: bool) -> BufferedFunction:
 
 @graph_cache(maxsize=32)
 def discretisation(n: int, *, point: bool = False) -> Any:
-    """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q)) -> [A, c, B, E],
-    column by column in one vector.
+    """Exact discretisation as one graph: (K, G, F - F_ext, x, [c, dt], M, d vec(M) / d(p, q), u) -> [A, c, B,
+    E], column by column in one vector.
 
     ``point``: M is that of a point mass, M[0, 0] times the identity, and fixed. Then all is made of powers of K, in a
     third of the operations.

@@ -94,6 +94,7 @@ class ControlStep:
         self.sent: deque[np.ndarray] = deque()
         self.on_the_way: deque[np.ndarray] = deque()
         self.plan: Plan | None = None
+        self._begun_anew = False  # by the tip of this period, against the estimate
 
     @property
     def expected(self) -> np.ndarray:
@@ -196,7 +197,7 @@ class ControlStep:
         self._tell(k, foresight)
         failure, pose_limits, outlook = "", None, None
         try:
-            outlook = foresight()
+            outlook = self._look_ahead(k, foresight)
             if not self.watch.idle:
                 pose_limits = self._near(outlook)
         except (PCRError, ValueError) as error:
@@ -249,19 +250,26 @@ class ControlStep:
             expected[:4] += change[:4]
             foresight.force[:] += change[4:]
             found.p = None  # it is done with
-        if found.velocity is not None:
-            self._begin_rods_anew(expected)
+        self._begun_anew = found.velocity is not None
         p = expected[:2] if found.p is None else found.p
         foresight.measured[:] = [*p, *(expected[4:] if found.q is None else found.q)]
         return found.events
 
-    def _begin_rods_anew(self, x: np.ndarray) -> None:
-        """Follow the rods to where the robot is after all: a wrong estimate, and a plan from there, lead anywhere."""
-        self.plan = None
-        with suppress(PCRError, ValueError):  # else the step says why there is no linear model
+    def _look_ahead(self, k: int, foresight: Foresight) -> Outlook:
+        """Where a tip was believed against the estimate: if rods and plan lead nowhere, from where the robot is."""
+        if not self._begun_anew:
+            return foresight()
+        reckoned = foresight.inputs["reckoned"].copy()
+        try:
+            return foresight()
+        except (PCRError, ValueError):
+            x = self.expected
             pose = solve_statics(self.robot, x[:2], x[4:], guess=self.pose)
-            self._predicts = LinearModels.of([self.foresight.follow(x, pose)])
+            self._predicts, self.plan = LinearModels.of([foresight.follow(x, pose)]), None
             self.watch.reset(x, pose)
+            foresight.inputs["reckoned"][:] = reckoned
+            self._tell(k, foresight)
+            return foresight()
 
     def _tell(self, k: int, foresight: Foresight) -> None:
         """Write the rest of what is known in period k into the graph that looks ahead."""

@@ -204,6 +204,7 @@ class Foresight:
     def follow(self, x: np.ndarray, pose: Equilibrium) -> LinearModel:
         """All rods are in ``pose`` at the state x, and nothing else changes; return the linear model there."""
         self._plant.reset(x, pose)
+        self._plant.carry(float(self.inputs["payloads"].ravel()[0]), x)
         model = linearise(self._plant, x, np.zeros(len(x) - 4), self._period, self.force)
         self._records[:] = self._plant.record
         return model

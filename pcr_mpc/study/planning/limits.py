@@ -32,6 +32,7 @@ UNITS = {
     "rod margin": "1",
     "strain": "1",
 }
+MOST_MARGIN = 0.9  # of a rod, that may be asked for
 _WATCHED = 0.8  # of a margin's limit, from which on its slope is computed
 _ANGLE = 1e-5  # by which motors are turned to see how margins change [rad]
 
@@ -73,7 +74,7 @@ class PlanLimits:
             if getattr(self, field.name) != math.inf:
                 check_numbers(self, {field.name: {"above": 0.0}})
         if self.rod_margin != -math.inf:
-            check_numbers(self, {"rod_margin": {"maximum": 0.9}})
+            check_numbers(self, {"rod_margin": {"maximum": MOST_MARGIN}})
         check_numbers(self, {"stiffness": {"minimum": 0.0}})
 
     def value(self, kind: str) -> float | None:

@@ -10,7 +10,7 @@ from typing import Any
 from ...errors import ConvergenceError, PCRError
 from ...loop.demand.feasibility import reference_demand, reference_of
 from ...loop.scene.scene import Scene
-from .limits import PlanLimits
+from .limits import MOST_MARGIN, PlanLimits
 from .timed_path import RodsMass, TimedPath
 
 _MOTORS = "rate_rad_s", "rate_change_rad_s2", "torque_Nm"
@@ -74,7 +74,7 @@ def _lowered(limits: PlanLimits, factors: dict[str, float]) -> PlanLimits:
         if kind == "strains":
             changed[kind] = tuple(factor * one for one in value)
         elif kind == "rod_margin":
-            changed[kind] = 1.0 - factor * (1.0 - value)
+            changed[kind] = min(MOST_MARGIN, 1.0 - factor * (1.0 - value))
         else:
             changed[kind] = value / factor if kind == "stiffness" else factor * value
     return replace(limits, **changed)

@@ -19,7 +19,6 @@ from pcr_mpc import (
 )
 from pcr_mpc.loop.references.trajectory import smooth_step
 from pcr_mpc.plant.statics.stability import least_rod_margin
-from pcr_mpc.report.designs.plan_table import plan_table
 from pcr_mpc.study.planning.along_path import refining
 from pcr_mpc.study.planning.along_path.course import paced
 from pcr_mpc.study.planning.along_path.meshing import points
@@ -36,7 +35,6 @@ NO_MOTORS = {"rate": 1e6, "acceleration": 1e12, "torque": 1e3}
 def test_limits_are_kept_at_ten_times_the_grid(points_scene, planned):
     """Angles found one by one, rates and their change by differences of the angles alone."""
     assert planned.excess <= 1e-3
-    assert "may take longer than it must" not in plan_table(planned.summary())
     scene, robot = points_scene, points_scene.robot
     t = np.linspace(0.0, planned.duration, 10 * planned.grid + 1)
     step = t[1]

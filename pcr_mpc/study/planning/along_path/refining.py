@@ -67,7 +67,7 @@ def refined(timing: Timing, told: Callable[[float], None] | None = None) -> tupl
     limit, at = np.unravel_index(int(checked.shares.argmax()), checked.shares.shape)
     raise ConvergenceError(
         f"the plan still exceeds the limit on {fine.uses[limit].limit} by {100 * (checked.worst - 1):.3g} % at "
-        f"{times(fine.pace, checked.x)[at]:.4f} s after {_ROUNDS} refinements; allow more of "
+        f"{times(fine.pace, checked.x)[at]:.4f} s after {_ROUNDS} refinements at most; allow more of "
         f"it, or take other cells than {cells_of(fine.pace)}",
         residual=checked.worst - 1.0,
         iterations=_ROUNDS,
