@@ -23,7 +23,6 @@ from .moving_rods import MovingRods
 # each time the error falls as the rods' share of the mass, 1/200 of the change on the default robot.
 _SETTLED = 1e-5
 _MOST_SWEEPS = 20
-_RISE = 1  # widths of its derivatives in which the rods' inertia comes into play, from rest
 _STRIDE = 25  # periods from which to which the rods are followed along a reference that was solved before
 _SHARE_RESOLUTION = 0.01
 
@@ -109,7 +108,8 @@ def feed_forward(scene: Scene, robot: Robot, pose: Equilibrium, horizon: int, in
     q = poses.q
     if inertia != "none":
         massless, rods = forces, MovingRods(poses, pose, inertia, scene.period)
-        risen = smooth_step(t / (_RISE * rods.width))[0][:, None] if not v[0].any() else 1.0
+        # From rest the rods' inertia comes into play within the width of its derivatives.
+        risen = smooth_step(t / rods.width)[0][:, None] if not v[0].any() else 1.0
         for _ in range(_MOST_SWEEPS):
             forces, own = rods.forces(poses, v, forces, loads - robot.drag * v, carried)
             # What would have had to begin before the start is left out.

@@ -13,20 +13,19 @@ from .many_poses.equilibria import Equilibria
 _ROUGH, _ROUGH_STEEP, _STEEP, _NEAR_STEEP = 0.011, 0.05, -0.14, 0.1
 
 
-def loads(poses: Equilibria, exact: np.ndarray | None = None) -> np.ndarray:
+def loads(poses: Equilibria, exact: np.ndarray) -> np.ndarray:
     """Lambda over lambda_c of plain rods in closed form, shape (R, n).
 
     Parameters
     ----------
     poses : Equilibria
-    exact : ndarray of bool, shape (R, n), optional
+    exact : ndarray of bool, shape (R, n)
         Of which rods it is to be exact; of the others it is good to 1 %, and to 5 % near log tip_angle = -0.14.
-        None: of all.
     """
     robot = poses.robot
     load = robot.lengths * np.sqrt(np.linalg.norm(poses.rod_forces, axis=2) / robot.stiffnesses)
     critical = rough_critical_load(poses.unknowns[:, :, 0])
-    for row, rod in np.argwhere(np.ones(load.shape, dtype=bool) if exact is None else exact):
+    for row, rod in np.argwhere(exact):
         critical[row, rod] = critical_load(float(poses.unknowns[row, rod, 0]))
     return np.asarray(load / critical)
 
